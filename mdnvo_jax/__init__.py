@@ -1,0 +1,26 @@
+"""Visual odometry that knows how sure it is: MDN-VO in JAX.
+
+The public names are imported when they are first used, so that `import mdnvo_jax.mixture` costs jax alone.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+__version__ = "0.1.0"
+
+_HOME = {
+    "Trajectory": "mdnvo_jax.odometry",
+    "load": "mdnvo_jax.odometry",
+    "predict": "mdnvo_jax.odometry",
+}
+__all__ = ["Trajectory", "__version__", "load", "predict"]
+
+if TYPE_CHECKING:
+    from mdnvo_jax.odometry import Trajectory, load, predict
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name from the module that defines it."""
+    if name not in _HOME:
+        raise AttributeError(f"module 'mdnvo_jax' has no attribute {name!r}")
+    return getattr(import_module(_HOME[name]), name)

@@ -1,0 +1,226 @@
+"""The configuration of an experiment: frozen dataclasses, loaded from a Python file, overridden on the command line.
+
+A config file (see `configs/`) assigns a `Config` to the name `config`. Fields whose comment says "not given in the
+paper" are ours to choose; the comment says why the default is what it is.
+"""
+
+import argparse
+import dataclasses
+import json
+import runpy
+import types
+import typing
+from pathlib import Path
+from typing import Any, Literal
+
+from mdnvo_jax.errors import InputError
+
+
+@dataclasses.dataclass(frozen=True)
+class ImageConfig:
+    """How a decoded frame becomes the input of the network. Stored with the checkpoint: prediction repeats it."""
+
+    # Rows and columns of the network's input. Not given in the paper; DeepVO code commonly uses 608x184 for KITTI.
+    height: int = 184
+    width: int = 608
+    # 1 is grey, 3 is RGB.
+    channels: int = 3
+    # How uint8 becomes float. "standard": x / 255 - 0.5. "local_contrast": square root, minus a local Gaussian mean,
+    # over a local deviation; makes rendered and real frames alike. "flownet": minus FlowNet's means, for its weights.
+    normalisation: Literal["standard", "local_contrast", "flownet"] = "standard"
+    # Intrinsics fx, fy, cx, cy of the virtual camera every frame is cropped and scaled to, in pixels of height x width,
+    # pixel centres at whole numbers. Empty: training takes those of the first sequence that has any, scaled to fit.
+    camera: tuple[float, ...] = ()
+    # Whether frames with known intrinsics are brought to the virtual camera. Off: the whole frame is resized.
+    rectify: bool = True
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelConfig:
+    """The network: convolution stack, BiLSTM, head."""
+
+    # Multiplies the channels 64..1024 of the paper's stack.
+    width: float = 1.0
+    # Paper: dropout 0.1 on the convolutions.
+    conv_dropout: float = 0.1
+    # Units a direction, and layers, of the LSTM. Not given in the paper; DeepVO has two layers of 1000.
+    lstm_hidden: int = 1000
+    lstm_layers: int = 2
+    # Paper: 0.2 on the LSTM.
+    lstm_dropout: float = 0.2
+    # Paper: bidirectional. False gives a causal LSTM.
+    bidirectional: bool = True
+    # "mixture" is the paper's head, "regression" DeepVO's.
+    head: Literal["mixture", "regression"] = "mixture"
+    # Gaussians in the mixture. Not given in the paper.
+    components: int = 3
+    # "independent": equations 3 to 5, a product over dimensions. "joint": a mixture of diagonal Gaussians.
+    coupling: Literal["independent", "joint"] = "independent"
+    # Floors of the predicted standard deviation. Not given in the paper, whose density has none: without one a
+    # dimension that never varies runs to a likelihood of infinity.
+    translation_floor_m: float = 1e-3
+    rotation_floor_rad: float = 1e-4
+
+
+@dataclasses.dataclass(frozen=True)
+class DataConfig:
+    """Which frames, cut into which windows, with which augmentation."""
+
+    # "kitti": a folder in the layout of the odometry benchmark. "synthetic": rendered while training.
+    dataset: Literal["kitti", "synthetic"] = "kitti"
+    root: str = ""
+    # Paper: left colour camera.
+    camera_folder: str = "image_2"
+    # Paper's training split.
+    train_sequences: tuple[str, ...] = ("00", "01", "02", "04", "08", "09")
+    # Sequences of the validation split. The paper names none; empty: the tail of every training sequence.
+    validation_sequences: tuple[str, ...] = ()
+    validation_tail: float = 0.1
+    # Folder made by bin/prepare_kitti; empty: decode while training.
+    cache: str = ""
+    # Steps in a window (frames - 1). Not given in the paper.
+    window: int = 6
+    # Shortest window drawn; 0 means always `window`.
+    shortest_window: int = 0
+    # Frames between the starts of two training windows.
+    hop: int = 1
+    # Strides over time that windows are drawn with; (1, 2) also trains on every second frame.
+    strides: tuple[int, ...] = (1,)
+    # Chances that a window is played backwards, or mirrored left-right, with its labels transformed exactly.
+    reverse: float = 0.0
+    mirror: float = 0.0
+    # Strength of the photometric augmentation (gain, gamma, offset, noise); 0 turns it off.
+    photometric: float = 0.0
+    # Threads that read and decode.
+    threads: int = 2
+    # Worlds and frames of the synthetic data set; validation worlds come on top and are disjoint by seed.
+    worlds: int = 64
+    world_frames: int = 120
+    validation_worlds: int = 8
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainingConfig:
+    """Loss, optimiser, schedule and bookkeeping."""
+
+    seed: int = 0
+    batch_size: int = 8
+    # Paper: about 40 epochs.
+    epochs: int = 40
+    # Steps in an epoch; 0 means once through the training windows.
+    steps_per_epoch: int = 0
+    # Paper: Adam (0.9, 0.999), 1e-3, plateau with patience 8 and factor 0.7.
+    learning_rate: float = 1e-3
+    beta1: float = 0.9
+    beta2: float = 0.999
+    plateau_patience: int = 8
+    plateau_factor: float = 0.7
+    # Least absolute improvement of the validation loss that counts. Absolute, since a NLL is often negative.
+    plateau_threshold: float = 1e-4
+    # Largest global norm of the gradient; 0 turns clipping off. Not given in the paper.
+    gradient_clip: float = 10.0
+    # "sequence": equations 6 and 7, minus the log of the mean likelihood. "mean": the mean of the NLLs.
+    reduction: Literal["sequence", "mean"] = "sequence"
+    # Weight of the rotation in DeepVO's loss (its paper: 100), for head "regression" only.
+    kappa: float = 100.0
+    # Stack parameters made by bin/convert_flownet; empty: Xavier everywhere. Paper: FlowNet.
+    initial_stack: str = ""
+    # Checkpoints to keep: the newest ones, beside the best.
+    keep_latest: int = 2
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """One experiment."""
+
+    image: ImageConfig = ImageConfig()
+    model: ModelConfig = ModelConfig()
+    data: DataConfig = DataConfig()
+    training: TrainingConfig = TrainingConfig()
+
+
+def load_config(path: str) -> Config:
+    """Run the Python file at `path` and return the `Config` it assigns to the name `config`.
+
+    Raises:
+      InputError: there is no such file, it does not run, or it assigns no `Config`.
+    """
+    if not Path(path).is_file():
+        raise InputError(f"no config file {path!r}: expected a Python file such as configs/kitti_small.py")
+    try:
+        found = runpy.run_path(path).get("config")
+    except Exception as error:
+        raise InputError(f"the config file {path} does not run: {type(error).__name__}: {error}") from error
+    if not isinstance(found, Config):
+        raise InputError(
+            f"{path} assigns {type(found).__name__} to the name `config`: expected a mdnvo_jax.config.Config"
+        )
+    return found
+
+
+def as_json(config: Config) -> str:
+    """Return `config` as indented JSON."""
+    return json.dumps(dataclasses.asdict(config), indent=2) + "\n"
+
+
+def from_json(text: str) -> Config:
+    """Return the `Config` that `as_json` wrote.
+
+    Raises:
+      InputError: a section or a field is unknown, or the text is no JSON object.
+    """
+    try:
+        stored = json.loads(text)
+        sections = {}
+        for section in dataclasses.fields(Config):
+            kind = typing.get_type_hints(Config)[section.name]
+            values = {name: tuple(v) if isinstance(v, list) else v for name, v in stored[section.name].items()}
+            sections[section.name] = kind(**values)
+        return Config(**sections)
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        raise InputError(f"unreadable stored configuration ({error}): expected one written by this version") from error
+
+
+def add_overrides(parser: argparse.ArgumentParser) -> None:
+    """Add an option `--SECTION.FIELD` to `parser` for every field of a `Config`."""
+    for section in dataclasses.fields(Config):
+        kind = typing.get_type_hints(Config)[section.name]
+        group = parser.add_argument_group(section.name, (kind.__doc__ or "").splitlines()[0])
+        for name, hint in typing.get_type_hints(kind).items():
+            group.add_argument(
+                f"--{section.name}.{name}", dest=f"{section.name}.{name}", default=None, **_argument(hint)
+            )
+
+
+def apply_overrides(config: Config, options: argparse.Namespace) -> Config:
+    """Return `config` with every option that `add_overrides` added and the user gave."""
+    for section in dataclasses.fields(Config):
+        given = {
+            name.removeprefix(f"{section.name}."): tuple(value) if isinstance(value, list) else value
+            for name, value in vars(options).items()
+            if name.startswith(f"{section.name}.") and value is not None
+        }
+        config = dataclasses.replace(
+            config, **{section.name: dataclasses.replace(getattr(config, section.name), **given)}
+        )
+    return config
+
+
+def _argument(hint: Any) -> dict[str, Any]:
+    """Return the keyword arguments of `add_argument` for a field of type `hint`."""
+    origin, arguments = typing.get_origin(hint), typing.get_args(hint)
+    if origin is Literal:
+        return {"choices": arguments}
+    if origin is tuple:
+        return {"type": arguments[0], "nargs": "*", "metavar": arguments[0].__name__.upper()}
+    if hint is bool:
+        return {"type": _boolean, "metavar": "{true,false}"}
+    assert not isinstance(hint, types.UnionType), "a field has one type: an empty value stands for 'not set'"
+    return {"type": hint, "metavar": hint.__name__.upper()}
+
+
+def _boolean(text: str) -> bool:
+    """Return the truth value of the words true and false."""
+    if text.lower() not in ("true", "false"):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected true or false")
+    return text.lower() == "true"

@@ -1,0 +1,1 @@
+"""From files, or a rendered world, to batches of windows."""

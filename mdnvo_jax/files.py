@@ -1,0 +1,53 @@
+"""Output folders that are never overwritten silently, and files that are whole or absent."""
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+from mdnvo_jax.errors import InputError
+
+
+@contextlib.contextmanager
+def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:
+    """Give a temporary path beside `path`; it takes the place of `path` when the block ends without an error.
+
+    The temporary name keeps the suffix of `path`, since writers (matplotlib, numpy, OpenCV) choose the format by it.
+    """
+    path = Path(path)
+    descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.stem}-", suffix=path.suffix)
+    os.close(descriptor)
+    try:
+        yield Path(temporary)
+        # mkstemp makes files private; give the result the permissions that an ordinary new file would have.
+        mask = os.umask(0)
+        os.umask(mask)
+        Path(temporary).chmod(0o666 & ~mask)
+        Path(temporary).replace(path)
+    finally:
+        Path(temporary).unlink(missing_ok=True)
+
+
+def write_text(path: str | os.PathLike[str], text: str) -> None:
+    """Write `text` to `path` as UTF-8, whole or not at all."""
+    with whole_file(path) as temporary:
+        temporary.write_text(text, encoding="utf-8")
+
+
+def claim_output(directory: str | os.PathLike[str], *, force: bool) -> Path:
+    """Make `directory` and return it.
+
+    Raises:
+      InputError: it holds files already and `force` is false, or it is a file, or it cannot be made.
+    """
+    directory = Path(directory)
+    if directory.exists() and not directory.is_dir():
+        raise InputError(f"{directory} is a file; expected a folder to write into: choose another --output")
+    if directory.is_dir() and any(directory.iterdir()) and not force:
+        raise InputError(f"{directory} holds files already: choose another --output, or overwrite with --force")
+    try:
+        directory.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot make the folder {directory} ({error.strerror}): choose another --output") from error
+    return directory

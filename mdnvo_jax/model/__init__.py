@@ -1,0 +1,1 @@
+"""The network: convolution stack, BiLSTM, head."""

@@ -1,0 +1,1 @@
+"""The state, the step, the loop and what they leave on disk."""

@@ -1,0 +1,26 @@
+"""What every test may use."""
+
+import os
+import tempfile
+from pathlib import Path
+
+import pytest
+
+
+# Programs that several tests and the processes they start compile alike are compiled once.
+_CACHE = tempfile.TemporaryDirectory(prefix="mdnvo-test-cache-")
+os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", _CACHE.name)
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
+# Tests compute little and compile much: a lower level of optimisation halves their time.
+os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=1".strip()
+
+
+@pytest.fixture(scope="session")
+def data_root() -> Path:
+    """The folder of real clips; without it the test is skipped."""
+    default = Path(__file__).resolve().parents[2] / "shared" / "data"
+    root = Path(os.environ.get("MDNVO_DATA", default))
+    if not root.is_dir():
+        pytest.skip(f"no real data at {root}: set MDNVO_DATA to the folder that holds kitti/ and trajectories/")
+    return root
