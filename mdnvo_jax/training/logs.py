@@ -1,0 +1,140 @@
+"""What a training tells: a progress bar, metrics.csv, TensorBoard events."""
+
+import csv
+import io
+import math
+import os
+import platform
+import shlex
+import subprocess
+import sys
+from collections.abc import Iterable, Iterator
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+import jax
+import rich.console
+import rich.progress
+from tensorboardX import SummaryWriter
+
+from mdnvo_jax import files
+
+CSV = "metrics.csv"
+
+
+class Logs:
+    """The logs of one training, in its workdir; rows after `step` from an earlier run are dropped."""
+
+    def __init__(self, workdir: Path, step: int) -> None:
+        self._csv = workdir / CSV
+        self._rows = [row for row in read_rows(self._csv) if int(row["step"]) <= step]
+        self._events = SummaryWriter(str(workdir / "tensorboard"), purge_step=step + 1, flush_secs=10)
+
+    def scalars(self, step: int, values: dict[str, float]) -> None:
+        """Write scalars to TensorBoard."""
+        for name, value in values.items():
+            self._events.add_scalar(name, value, step)
+
+    def epoch(self, row: dict[str, float]) -> None:
+        """Add a row to metrics.csv, which is rewritten whole, and its values to TensorBoard."""
+        self._rows.append({name: _number(value) for name, value in row.items()})
+        text = io.StringIO()
+        writer = csv.DictWriter(text, list(self._rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(self._rows)
+        files.write_text(self._csv, text.getvalue())
+        self.scalars(int(row["step"]), {f"epoch/{name}": value for name, value in row.items() if name != "step"})
+
+    def close(self) -> None:
+        """Finish the events file."""
+        self._events.close()
+
+
+def read_rows(path: Path) -> list[dict[str, str]]:
+    """Return the rows of a metrics file, none where there is no file."""
+    if not path.exists():
+        return []
+    with path.open(newline="", encoding="utf-8") as stream:
+        return list(csv.DictReader(stream))
+
+
+def _number(value: float) -> str:
+    """Return a number as text that reads back to the same float32."""
+    return str(value) if isinstance(value, int) else f"{value:.9g}"
+
+
+def environment() -> dict[str, Any]:
+    """Return the command, the versions and the machine, as they belong beside a result."""
+    return {
+        "command": shlex.join(sys.orig_argv),
+        "git": _git_hash(),
+        "versions": versions(),
+        "platform": platform.platform(),
+        "devices": [str(device) for device in jax.devices()],
+        "processors": os.cpu_count(),
+    }
+
+
+def versions() -> dict[str, str]:
+    """Return the versions of Python and of the packages that results depend on."""
+    names = (
+        "mdnvo_jax",
+        "jax",
+        "jaxlib",
+        "flax",
+        "optax",
+        "orbax-checkpoint",
+        "grain",
+        "numpy",
+        "opencv-python-headless",
+    )
+    return {"python": platform.python_version(), **{name: metadata.version(name) for name in names}}
+
+
+def _git_hash() -> str | None:
+    """Return the commit of the checkout this package runs from, None where it is installed or git is missing."""
+    command = ["git", "-C", str(Path(__file__).parent), "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*"]
+    try:
+        return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
+    except (OSError, subprocess.CalledProcessError):
+        return None
+
+
+class EpochProgress:
+    """A bar over the steps of an epoch with rate, time to go and loss, on stderr; silent where that is no terminal."""
+
+    def __init__(self, title: str, total: int, start: int) -> None:
+        console = rich.console.Console(stderr=True)
+        self._bar = rich.progress.Progress(
+            "{task.description}",
+            rich.progress.BarColumn(),
+            rich.progress.MofNCompleteColumn(),
+            "{task.fields[rate]}",
+            rich.progress.TimeRemainingColumn(),
+            "{task.fields[note]}",
+            console=console,
+            disable=not console.is_terminal,
+        )
+        self._task = self._bar.add_task(title, total=total, completed=start, rate="", note="")
+
+    def __enter__(self) -> "EpochProgress":
+        self._bar.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._bar.stop()
+
+    def advance(self, loss: float) -> None:
+        """Count one step and show its loss."""
+        speed = self._bar.tasks[0].speed
+        rate = f"{speed:.2f} steps/s" if speed else ""
+        self._bar.update(self._task, advance=1, rate=rate, note="" if math.isnan(loss) else f"loss {loss:.4g}")
+
+
+def track(items: Iterable[Any], title: str, total: int) -> Iterator[Any]:
+    """Yield `items` beneath a progress bar on stderr, silent where that is no terminal."""
+    console = rich.console.Console(stderr=True)
+    return iter(
+        rich.progress.track(items, title, total=total, console=console, transient=True, disable=not console.is_terminal)
+    )

@@ -1,0 +1,260 @@
+"""The loop: epochs of steps, a validation and a checkpoint after each, an orderly stop at any time."""
+
+import contextlib
+import dataclasses
+import json
+import math
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from mdnvo_jax import config as configuration
+from mdnvo_jax import files
+from mdnvo_jax.config import Config
+from mdnvo_jax.data.load import load_split
+from mdnvo_jax.data.windows import batches_per_epoch, label_statistics, training_batches, validation_batches
+from mdnvo_jax.errors import InputError
+from mdnvo_jax.model.flownet import load_stack
+from mdnvo_jax.model.head import Labels
+from mdnvo_jax.model.network import Network, build
+from mdnvo_jax.training import checkpoint, logs, parallel, step
+from mdnvo_jax.training.state import TRAIN_METRICS, State, initial_state, initial_variables, state_template
+
+# Steps between two rows of TensorBoard.
+_LOG_EVERY = 10
+
+
+class NonFiniteError(RuntimeError):
+    """The loss or the gradient is infinite or not a number."""
+
+
+class Stopped(Exception):  # noqa: N818 - no error
+    """A signal ended the training in order, everything is saved; `signal_number` says which."""
+
+    def __init__(self, message: str, signal_number: int) -> None:
+        super().__init__(message)
+        self.signal_number = signal_number
+
+
+class StopRequest:
+    """Whether a signal asked the training to stop."""
+
+    def __init__(self) -> None:
+        self.signal: signal.Signals | None = None
+
+    @contextlib.contextmanager
+    def listening(self) -> Iterator["StopRequest"]:
+        """Turn SIGTERM and the first SIGINT into a request; a second SIGINT interrupts at once, as it always does."""
+        previous = {number: signal.getsignal(number) for number in (signal.SIGTERM, signal.SIGINT)}
+
+        def request(number: int, _: object) -> None:
+            self.signal = signal.Signals(number)
+            print(f"{self.signal.name}: saving a checkpoint, then stopping", file=sys.stderr)
+            signal.signal(signal.SIGINT, signal.default_int_handler)
+
+        try:
+            for number in previous:
+                signal.signal(number, request)
+            yield self
+        finally:
+            for number, handler in previous.items():
+                signal.signal(number, handler)
+
+
+def train(config: Config, workdir: Path, *, resume: bool = False) -> str:
+    """Train as `config` says and leave everything in `workdir`.
+
+    Args:
+      config: the experiment.
+      workdir: gets config.json, environment.json, labels.json, checkpoints/, metrics.csv and tensorboard/.
+      resume: go on from the newest checkpoint in `workdir`, bit for bit as if the training had never stopped.
+
+    Returns:
+      A summary of one paragraph.
+
+    Raises:
+      InputError: the data, the configuration or the state of `workdir` do not allow it.
+      NonFiniteError: the training diverged; the last checkpoint is kept.
+      Stopped: SIGTERM or SIGINT ended it; a checkpoint of the last step is kept.
+    """
+    _claim(workdir, resume)
+    train_set, validation_set, image = load_split(config)
+    config = dataclasses.replace(config, image=image)
+    if resume:
+        _check_same(config, workdir)
+    mesh = parallel.make_mesh(config.training.batch_size)
+    share = {"rank": jax.process_index(), "world": jax.process_count()}
+    batches = training_batches(train_set, config, seed=config.training.seed, **share)
+    steps_per_epoch = config.training.steps_per_epoch or batches_per_epoch(train_set, config)
+    network = build(config.image, config.model)
+    store = checkpoint.Store(workdir, config.training.keep_latest)
+    everywhere = parallel.replicated(mesh)
+    if resume:
+        restored = store.restore(checkpoint.abstract(state_template(network, config), everywhere))
+        state = restored.state
+        batches.set_state(restored.data_state)
+    else:
+        labels = Labels(*label_statistics(train_set, config.data))
+        state = jax.device_put(initial_state(_first_variables(network, config), config, labels), everywhere)
+        _describe(workdir, config, labels)
+    run = _Run(config, workdir, network, mesh, store, steps_per_epoch, int(state.step))
+    try:
+        return run.epochs(state, batches, lambda: validation_batches(validation_set, config, **share))
+    finally:
+        store.close()
+        run.logs.close()
+
+
+def _claim(workdir: Path, resume: bool) -> None:
+    """Make `workdir`, or refuse: a training is neither overwritten nor resumed by accident."""
+    found = (workdir / checkpoint.FOLDER).is_dir() and checkpoint.steps_in(workdir / checkpoint.FOLDER)
+    if found and not resume:
+        raise InputError(f"{workdir} holds checkpoints of a training: go on with --resume, or choose another --workdir")
+    if resume and not found:
+        raise InputError(f"no checkpoint to resume from in {workdir}: start without --resume, or name its --workdir")
+    try:
+        workdir.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"cannot make the folder {workdir} ({error.strerror}): choose another --workdir") from error
+
+
+def _check_same(config: Config, workdir: Path) -> None:
+    """Refuse to resume with another configuration than the training began with; only `epochs` may change."""
+    before = json.loads((workdir / "config.json").read_text())
+    now = json.loads(configuration.as_json(config))
+    before["training"].pop("epochs")
+    now["training"].pop("epochs")
+    different = [f"{s}.{f}" for s, fields in now.items() for f, value in fields.items() if before[s].get(f) != value]
+    if different:
+        raise InputError(
+            f"{', '.join(different)} differ from {workdir / 'config.json'}: "
+            "resume with the same configuration (only training.epochs may change), or train in another --workdir"
+        )
+
+
+def _first_variables(network: Network, config: Config) -> Any:
+    """Return the variables to start from, with the stack's weights from a file where the config names one."""
+    variables = initial_variables(network, config)
+    return load_stack(config.training.initial_stack, variables) if config.training.initial_stack else variables
+
+
+def _describe(workdir: Path, config: Config, labels: Labels) -> None:
+    """Write what the training is: its configuration, its environment, its labels' statistics."""
+    files.write_text(workdir / "config.json", configuration.as_json(config))
+    files.write_text(workdir / "environment.json", json.dumps(logs.environment(), indent=2) + "\n")
+    names = ("tx_m", "ty_m", "tz_m", "rx_rad", "ry_rad", "rz_rad")
+    statistics = {key: dict(zip(names, map(float, values), strict=True)) for key, values in labels._asdict().items()}
+    files.write_text(workdir / "labels.json", json.dumps(statistics, indent=2) + "\n")
+
+
+class _Run:
+    """What stays the same while a training runs."""
+
+    def __init__(
+        self,
+        config: Config,
+        workdir: Path,
+        network: Network,
+        mesh: jax.sharding.Mesh,
+        store: checkpoint.Store,
+        steps_per_epoch: int,
+        first_step: int,
+    ) -> None:
+        self.config, self.workdir, self.mesh, self.store = config, workdir, mesh, store
+        self.steps_per_epoch = steps_per_epoch
+        self.logs = logs.Logs(workdir, first_step)
+        self.first_step = first_step
+        self.train_step = parallel.compile_step(step.bind(step.train_step, network, config), mesh, donate=True)
+        self.validation_step = parallel.compile_step(
+            step.bind(step.validation_step, network, config), mesh, donate=False
+        )
+        self.end_epoch = jax.jit(lambda state, sums: step.end_epoch(state, sums, config=config))
+
+    def epochs(self, state: State, batches: Any, validation: Any) -> str:
+        """Run from where `state` is to the last epoch, or to a signal."""
+        started = time.monotonic()
+        best = min((float(row["validation_loss"]) for row in logs.read_rows(self.workdir / logs.CSV)), default=math.inf)
+        with StopRequest().listening() as stop:
+            for epoch in range(int(state.epoch), self.config.training.epochs):
+                state = self.steps(state, batches, epoch, stop)
+                if stop.signal:
+                    self.store.save(state, batches.get_state(), self.config)
+                    self.store.wait()
+                    message = f"stopped by {stop.signal.name} after step {int(state.step)}; go on with --resume"
+                    raise Stopped(message, stop.signal)
+                state, row = self.validate(state, validation(), epoch)
+                self.store.save(state, batches.get_state(), self.config, row["validation_loss"])
+                self.logs.epoch(row)
+                best = min(best, row["validation_loss"])
+                print(_epoch_line(row), flush=True)
+        self.store.wait()
+        steps = int(state.step) - self.first_step
+        seconds = time.monotonic() - started
+        rate = f"{steps / seconds:.2f} steps/s, validation included" if steps else "nothing was left to do"
+        return (
+            f"trained {self.config.training.epochs} epochs, {steps} steps in this run, in {seconds:.0f} s ({rate}); "
+            f"best validation loss {best:.4f}; everything is in {self.workdir}"
+        )
+
+    def steps(self, state: State, batches: Any, epoch: int, stop: StopRequest) -> State:
+        """Run the rest of an epoch, or to a signal."""
+        start = int(state.step) - epoch * self.steps_per_epoch
+        title = f"epoch {epoch + 1}/{self.config.training.epochs}"
+        pending: dict[str, jax.Array] | None = None
+        with logs.EpochProgress(title, self.steps_per_epoch, start) as progress:
+            for index in range(start, self.steps_per_epoch):
+                batch = parallel.place(next(batches), self.mesh)
+                state, metrics = self.train_step(state, batch)
+                # The step before is looked at while this one runs, so that the device never waits for us.
+                if pending is not None:
+                    self.inspect(pending, epoch * self.steps_per_epoch + index)
+                    progress.advance(float(pending["loss"]))
+                pending = metrics
+                if stop.signal:
+                    break
+            if pending is not None:
+                self.inspect(pending, int(state.step))
+                progress.advance(float(pending["loss"]))
+        return state
+
+    def inspect(self, metrics: dict[str, jax.Array], number: int) -> None:
+        """Stop at the first value that is not finite; write every few steps' metrics to TensorBoard."""
+        bad = [name for name in TRAIN_METRICS if not math.isfinite(metrics[name])]
+        if bad:
+            raise NonFiniteError(
+                f"{', '.join(bad)} not finite at step {number}: lower training.learning_rate or "
+                f"training.gradient_clip; the last good checkpoint in {self.workdir / checkpoint.FOLDER} is kept"
+            )
+        if number % _LOG_EVERY == 0:
+            self.logs.scalars(number, {f"step/{name}": float(value) for name, value in metrics.items()})
+
+    def validate(self, state: State, batches: Any, epoch: int) -> tuple[State, dict[str, float]]:
+        """Return the state for the next epoch, and this epoch's row of metrics.csv."""
+        sums: Any = None
+        for batch in batches:
+            found = self.validation_step(state.model, parallel.place(batch, self.mesh))
+            sums = found if sums is None else jax.tree.map(jax.numpy.add, sums, found)
+        row = {
+            "epoch": epoch + 1,
+            "step": int(state.step),
+            "learning_rate": self.config.training.learning_rate * float(state.plateau.scale),
+            **{name: float(state.sums[name]) / self.steps_per_epoch for name in TRAIN_METRICS},
+            **{name: float(value) for name, value in step.validation_metrics(sums).items()},
+        }
+        if not math.isfinite(row["validation_loss"]):
+            raise NonFiniteError(f"the validation loss is {row['validation_loss']} at step {row['step']}")
+        return self.end_epoch(state, sums), row
+
+
+def _epoch_line(row: dict[str, float]) -> str:
+    """Return the line that is printed after an epoch."""
+    return (
+        f"epoch {row['epoch']:>3}  step {row['step']:>6}  loss {row['loss']:8.4f}  "
+        f"validation {row['validation_loss']:8.4f}  {row['validation_translation_rmse_m']:.4f} m  "
+        f"{row['validation_rotation_rmse_deg']:.4f} deg  rate {row['learning_rate']:.2e}"
+    )

@@ -1,0 +1,187 @@
+"""The loop with real processes, files and signals: what it leaves, and that stopping it changes nothing."""
+
+import csv
+import json
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import cv2
+import jax
+import numpy as np
+import pytest
+
+from mdnvo_jax import train
+from mdnvo_jax.config import from_json
+from mdnvo_jax.errors import exit_code
+from mdnvo_jax.model.network import build
+from mdnvo_jax.training import checkpoint
+from mdnvo_jax.training.state import State, state_template
+
+CONFIG = """
+from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig, TrainingConfig
+config = Config(
+    image=ImageConfig(height=32, width=64, channels=1),
+    model=ModelConfig(width=1 / 16, lstm_hidden=8, lstm_layers=1, components=2),
+    data=DataConfig(
+        root={root!r}, camera_folder="image_0", train_sequences=("00",), validation_tail=0.2,
+        window=3, shortest_window=2, mirror=0.5, reverse=0.2, photometric=0.5,
+    ),
+    training=TrainingConfig(batch_size=4, epochs=3, plateau_patience=0, plateau_threshold=10.0),
+)
+"""
+
+
+@pytest.fixture(scope="module")
+def config_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A config on a drive of 60 noisy frames in KITTI's layout: enough for every part of the loop to turn."""
+    folder = tmp_path_factory.mktemp("loop")
+    generator = np.random.default_rng(0)
+    images = folder / "sequences" / "00" / "image_0"
+    images.mkdir(parents=True)
+    (folder / "poses").mkdir()
+    (folder / "sequences" / "00" / "calib.txt").write_text("P0: 40 0 31.5 0 0 40 15.5 0 0 0 1 0\n")
+    rows = []
+    for frame in range(60):
+        cv2.imwrite(str(images / f"{frame:06d}.png"), generator.integers(0, 256, (32, 64), dtype=np.uint8))
+        rows.append(f"1 0 0 0 0 1 0 0 0 0 1 {frame * (1 + 0.01 * frame):.6f}\n")
+    (folder / "poses" / "00.txt").write_text("".join(rows))
+    path = folder / "config.py"
+    path.write_text(CONFIG.format(root=str(folder)))
+    return path
+
+
+def start(config_file: Path, workdir: Path, *arguments: str) -> subprocess.Popen[str]:
+    command = [sys.executable, "-m", "mdnvo_jax.train", str(config_file), "--workdir", str(workdir), *arguments]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+
+
+def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:
+    out, err = process.communicate(timeout=300)
+    return process.returncode, out, err
+
+
+def last_state(workdir: Path) -> State:
+    config = from_json((workdir / "config.json").read_text())
+    store = checkpoint.Store(workdir, keep_latest=2)
+    try:
+        return store.restore(checkpoint.abstract(state_template(build(config.image, config.model), config))).state
+    finally:
+        store.close()
+
+
+def rows(workdir: Path) -> list[dict[str, str]]:
+    with (workdir / "metrics.csv").open(newline="") as stream:
+        return list(csv.DictReader(stream))
+
+
+@pytest.fixture(scope="module")
+def uninterrupted(config_file: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    workdir = tmp_path_factory.mktemp("runs") / "uninterrupted"
+    code, out, err = finish(start(config_file, workdir))
+    assert code == 0, err
+    assert "trained 3 epochs, 33 steps" in out
+    assert err == ""
+    return workdir
+
+
+def test_a_training_leaves_what_it_promises(uninterrupted: Path) -> None:
+    assert {entry.name for entry in uninterrupted.iterdir()} == {
+        "config.json",
+        "environment.json",
+        "labels.json",
+        "checkpoints",
+        "metrics.csv",
+        "tensorboard",
+    }
+    # 48 frames train: 45 windows of three steps, 11 batches of four.
+    assert [(row["epoch"], row["step"]) for row in rows(uninterrupted)] == [("1", "11"), ("2", "22"), ("3", "33")]
+    # The threshold asks for more than any epoch improves by, so that the second bad epoch lowers the rate.
+    assert [float(row["learning_rate"]) for row in rows(uninterrupted)] == pytest.approx([1e-3, 1e-3, 0.7e-3])
+    labels = json.loads((uninterrupted / "labels.json").read_text())
+    assert set(labels) == {"mean", "std"}
+    assert json.loads((uninterrupted / "environment.json").read_text())["versions"]["jax"] == jax.__version__
+    config = from_json((uninterrupted / "config.json").read_text())
+    assert config.image.camera == pytest.approx((40, 40, 31.5, 15.5)), "the resolved camera belongs to the experiment"
+    assert any((uninterrupted / "tensorboard").iterdir())
+    # The two newest checkpoints are kept; the best is one of them or a third.
+    losses = [float(row["validation_loss"]) for row in rows(uninterrupted)]
+    best = checkpoint.locate(uninterrupted)
+    assert best.name == str(11 * (1 + int(np.argmin(losses))))
+    assert {22, 33} <= set(checkpoint.steps_in(uninterrupted / "checkpoints"))
+
+
+def assert_same(first: Path, second: Path) -> None:
+    leaves, others = (jax.tree.leaves_with_path(last_state(workdir)) for workdir in (first, second))
+    assert len(leaves) == len(others) > 50
+    for (path, leaf), (_, other) in zip(leaves, others, strict=True):
+        np.testing.assert_array_equal(leaf, other, err_msg=jax.tree_util.keystr(path))
+    assert rows(first) == rows(second)
+
+
+def test_two_halves_are_one_whole_bit_for_bit(config_file: Path, uninterrupted: Path, tmp_path: Path) -> None:
+    assert finish(start(config_file, tmp_path, "--training.epochs", "1"))[0] == 0
+    code, out, _ = finish(start(config_file, tmp_path, "--resume"))
+    assert code == 0
+    assert "22 steps in this run" in out
+    assert_same(tmp_path, uninterrupted)
+
+
+def test_sigterm_in_the_middle_of_an_epoch_changes_nothing(
+    config_file: Path, uninterrupted: Path, tmp_path: Path
+) -> None:
+    process = start(config_file, tmp_path)
+    assert process.stdout is not None
+    assert process.stdout.readline().startswith("epoch   1")
+    process.send_signal(signal.SIGTERM)
+    code, out, err = finish(process)
+    assert code == 128 + signal.SIGTERM
+    assert "SIGTERM: saving a checkpoint" in err
+    assert "go on with --resume" in out
+    assert 11 < int(last_state(tmp_path).step) <= 33
+    code, _, err = finish(start(config_file, tmp_path, "--resume"))
+    assert code == 0, err
+    assert_same(tmp_path, uninterrupted)
+
+
+def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
+    """Run the command in this process, assert that it is refused, return its one line."""
+    assert exit_code(train.main, arguments) == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    return captured.err
+
+
+def test_what_cannot_be_done_is_refused_in_one_line(
+    config_file: Path, uninterrupted: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config, workdir = str(config_file), str(uninterrupted)
+    before = (uninterrupted / "checkpoints").stat().st_mtime_ns
+    assert "go on with --resume" in refusal(capsys, config, "--workdir", workdir)
+    assert "no checkpoint to resume" in refusal(capsys, config, "--workdir", str(tmp_path), "--resume")
+    line = refusal(capsys, config, "--workdir", workdir, "--resume", "--model.components", "5", "--data.mirror", "0.1")
+    assert "model.components, data.mirror differ" in line
+    assert "no config file" in refusal(capsys, "missing.py", "--workdir", str(tmp_path))
+    assert "no sequence" in refusal(capsys, config, "--workdir", str(tmp_path), "--data.train_sequences", "77").lower()
+    assert "invalid choice" in refusal(capsys, config, "--workdir", str(tmp_path), "--model.head", "other")
+    assert "expected true or false" in refusal(capsys, config, "--workdir", str(tmp_path), "--image.rectify", "maybe")
+    assert (uninterrupted / "checkpoints").stat().st_mtime_ns == before
+
+
+def test_a_training_that_diverges_stops_and_keeps_its_last_checkpoint(config_file: Path, tmp_path: Path) -> None:
+    assert finish(start(config_file, tmp_path, "--training.epochs", "1"))[0] == 0
+    before = last_state(tmp_path)
+    # A label of 1e30 m makes the next epoch overflow.
+    path = tmp_path / "config.json"
+    stored = json.loads(path.read_text())
+    stored["training"]["learning_rate"] = 1e38
+    path.write_text(json.dumps(stored))
+    code, _, err = finish(start(config_file, tmp_path, "--resume", "--training.learning_rate", "1e38"))
+    assert code == 2
+    assert "not finite at step" in err
+    assert "Traceback" not in err
+    np.testing.assert_array_equal(
+        before.model.params["head"]["kernel"], last_state(tmp_path).model.params["head"]["kernel"]
+    )

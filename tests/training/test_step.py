@@ -1,0 +1,200 @@
+"""The train step: it learns, its schedule is PyTorch's, its sums add up, and devices do not change its result."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig, TrainingConfig
+from mdnvo_jax.model.head import Labels
+from mdnvo_jax.model.network import build
+from mdnvo_jax.training import step
+from mdnvo_jax.training.state import TRAIN_METRICS, State, initial_state, initial_variables, make_plateau
+
+CONFIG = Config(
+    image=ImageConfig(height=32, width=64, channels=1),
+    model=ModelConfig(width=1 / 16, lstm_hidden=8, lstm_layers=1, components=2),
+    data=DataConfig(window=3),
+    training=TrainingConfig(batch_size=4, learning_rate=3e-3),
+)
+LABELS = Labels(np.array([0, 0, 1, 0, 0, 0.0]), np.array([0.02, 0.02, 0.5, 0.005, 0.02, 0.005]))
+
+
+def with_(config: Config, **sections: dict) -> Config:
+    from dataclasses import replace
+
+    return replace(config, **{name: replace(getattr(config, name), **fields) for name, fields in sections.items()})
+
+
+def first_state(config: Config) -> State:
+    return initial_state(initial_variables(build(config.image, config.model), config), config, LABELS)
+
+
+def make_batch(seed: int = 0, batch: int = 4) -> step.Batch:
+    """Random frames; the labels are a function of them, so that there is something to learn."""
+    generator = np.random.default_rng(seed)
+    images = generator.integers(0, 256, (batch, 4, 32, 64, 1), dtype=np.uint8)
+    images = (images * np.linspace(0.3, 1, batch)[:, None, None, None, None]).astype(np.uint8)
+    strength = images[:, 1:].mean((2, 3, 4)) / 128 - 0.6
+    steps = np.asarray(LABELS.mean + LABELS.std * strength[..., None], np.float32)
+    mask = np.ones((batch, 3), bool)
+    mask[0, 2] = False
+    return {"images": jnp.asarray(images), "steps": jnp.asarray(steps), "mask": jnp.asarray(mask)}
+
+
+@pytest.mark.parametrize("head", ["mixture", "regression"])
+def test_training_on_one_batch_learns_it(head: str) -> None:
+    config = with_(CONFIG, model={"head": head})
+    network = build(config.image, config.model)
+    state = first_state(config)
+    batch = make_batch()
+    train_step = jax.jit(step.bind(step.train_step, network, config))
+    losses = []
+    for _ in range(40):
+        state, metrics = train_step(state, batch)
+        losses.append(float(metrics["loss"]))
+    assert int(state.step) == 40
+    if head == "mixture":
+        assert np.mean(losses[-5:]) < losses[0] - 2
+    else:
+        assert np.mean(losses[-5:]) < 0.5 * losses[0]
+    for name in TRAIN_METRICS:
+        assert np.isfinite(metrics[name])
+    np.testing.assert_allclose(state.sums["loss"], sum(losses), rtol=1e-4)
+
+
+def test_every_step_draws_its_own_dropout_and_the_same_one_again() -> None:
+    network = build(CONFIG.image, CONFIG.model)
+    config = with_(CONFIG, training={"learning_rate": 0.0})
+    state = first_state(config)
+    train_step = jax.jit(step.bind(step.train_step, network, config))
+    after, first = train_step(state, make_batch())
+    _, second = train_step(after, make_batch())
+    _, again = train_step(state, make_batch())
+    assert first["loss"] != second["loss"]
+    assert first["loss"] == again["loss"]
+
+
+def test_clipping_bounds_the_gradient_that_adam_sees() -> None:
+    network = build(CONFIG.image, CONFIG.model)
+    moments = []
+    for clip in (0.0, 1e-3):
+        config = with_(CONFIG, training={"gradient_clip": clip})
+        state = first_state(config)
+        state, metrics = jax.jit(step.bind(step.train_step, network, config))(state, make_batch())
+        first_moments = [
+            leaf for path, leaf in jax.tree.leaves_with_path(state.optimiser) if ".mu" in jax.tree_util.keystr(path)
+        ]
+        moments.append(float(jnp.sqrt(sum(jnp.sum(leaf**2) for leaf in first_moments))))
+    assert float(metrics["gradient_norm"]) > 1e-2
+    # Adam's first moment after one step is (1 - beta1) times the gradient.
+    np.testing.assert_allclose(moments[1], 0.1 * 1e-3, rtol=1e-3)
+    np.testing.assert_allclose(moments[0], 0.1 * float(metrics["gradient_norm"]), rtol=1e-3)
+
+
+def test_validation_does_not_see_padding() -> None:
+    network = build(CONFIG.image, CONFIG.model)
+    model = first_state(CONFIG).model
+    validate = step.bind(step.validation_step, network, CONFIG)
+    batch = make_batch()
+    whole = validate(model, batch)
+    # The same windows in two batches of three, the second filled up with windows that do not count.
+    padded = [
+        {name: value[:3] for name, value in batch.items()},
+        {name: value[jnp.array([3, 0, 0])] for name, value in batch.items()},
+    ]
+    padded[1]["mask"] = padded[1]["mask"].at[1:].set(False)
+    sums = jax.tree.map(jnp.add, *[validate(model, part) for part in padded])
+    for name, value in step.validation_metrics(whole).items():
+        np.testing.assert_allclose(step.validation_metrics(sums)[name], value, rtol=1e-4)
+    assert int(sums["count"]) == 11
+
+
+def test_validation_metrics_are_root_mean_squares() -> None:
+    sums = {"loss": jnp.array(6.0), "count": jnp.array(3), "squares": jnp.array([3.0, 0, 9, 0, 0.03, 0])}
+    metrics = step.validation_metrics(sums)
+    np.testing.assert_allclose(metrics["validation_loss"], 2)
+    np.testing.assert_allclose(metrics["validation_translation_rmse_m"], 2)
+    np.testing.assert_allclose(metrics["validation_rotation_rmse_deg"], np.degrees(0.1), rtol=1e-6)
+
+
+def test_the_plateau_is_that_of_pytorch() -> None:
+    """The scales are torch's ReduceLROnPlateau's, recorded by tests/golden/make_torch_golden.py."""
+    golden = json.loads((Path(__file__).parents[1] / "golden" / "plateau.json").read_text())
+    for case in golden:
+        plateau = make_plateau(
+            TrainingConfig(
+                plateau_patience=case["patience"], plateau_factor=case["factor"], plateau_threshold=case["threshold"]
+            )
+        )
+        update = jax.jit(lambda state, value, plateau=plateau: plateau.update({}, state, value=value)[1])
+        state = plateau.init({"w": jnp.zeros(())})
+        scales = []
+        for value in case["values"]:
+            state = update(state, value)
+            scales.append(float(state.scale))
+        np.testing.assert_allclose(scales, case["scales"], rtol=1e-6)
+        assert min(case["scales"]) < 1, "the case must lower the rate at least once"
+
+
+def test_the_end_of_an_epoch_renews_the_residual_scale_and_forgets_the_sums() -> None:
+    state = first_state(CONFIG)
+    state = state._replace(sums={name: jnp.ones(()) for name in state.sums})
+    squares = jnp.asarray(LABELS.std**2 * 4 * 7)
+    state = step.end_epoch(state, {"loss": jnp.array(7.0), "count": jnp.array(7), "squares": squares}, config=CONFIG)
+    np.testing.assert_allclose(state.model.residual_scale, 2 * np.ones(6), rtol=1e-5)
+    np.testing.assert_allclose(state.plateau.best_value, 1)
+    assert not any(state.sums.values())
+    assert int(state.epoch) == 1
+
+
+DEVICES_SCRIPT = """
+import sys
+sys.path[:0] = {path!r}
+import jax, jax.numpy as jnp, numpy as np, optax
+from test_step import CONFIG, first_state, make_batch, with_
+from mdnvo_jax.errors import InputError
+from mdnvo_jax.model.network import build
+from mdnvo_jax.training import parallel, state, step
+# Adam hides a gradient that is wrong by a factor: plain gradient descent does not.
+step.make_optimiser = state.make_optimiser = lambda config: optax.sgd(1e-3)
+config = with_(CONFIG, model={{"conv_dropout": 0.0, "lstm_dropout": 0.0}})
+network = build(config.image, config.model)
+mesh = parallel.make_mesh(4)
+current = jax.device_put(first_state(config), parallel.replicated(mesh))
+train_step = parallel.compile_step(step.bind(step.train_step, network, config), mesh, donate=True)
+losses = []
+for seed in range(5):
+    batch = parallel.place({{k: np.asarray(v) for k, v in make_batch(seed).items()}}, mesh)
+    current, metrics = train_step(current, batch)
+    losses.append(float(metrics["loss"]))
+flat = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves((current.model.params, current.model.batch_stats))])
+refused = ""
+try:
+    parallel.make_mesh(3)
+except InputError as error:
+    refused = str(error)
+np.savez(sys.argv[1], refused=refused, losses=losses, flat=flat, devices=len(batch["images"].sharding.device_set))
+"""
+
+
+def test_two_devices_compute_what_one_computes(tmp_path: Path) -> None:
+    found = []
+    for count in (1, 2):
+        flags = f"{os.environ['XLA_FLAGS']} --xla_force_host_platform_device_count={count}"
+        environment = {**os.environ, "XLA_FLAGS": flags}
+        script = DEVICES_SCRIPT.format(path=[str(Path(__file__).parent)])
+        result = tmp_path / f"{count}.npz"
+        subprocess.run([sys.executable, "-c", script, str(result)], env=environment, check=True)
+        found.append(np.load(result))
+    assert [int(item["devices"]) for item in found] == [1, 2]
+    assert not str(found[0]["refused"])
+    assert "batch_size is 3: expected a multiple of the 2 devices" in str(found[1]["refused"])
+    np.testing.assert_allclose(found[1]["losses"], found[0]["losses"], rtol=1e-4)
+    np.testing.assert_allclose(found[1]["flat"], found[0]["flat"], rtol=1e-3, atol=1e-5)
