@@ -1,0 +1,99 @@
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mdnvo_jax.data.augment import mirror_frame, photometric
+
+
+def blobs(camera, size, points):
+    """Return what a camera sees of smooth blobs around points (x, y, z) in its axes."""
+    fx, fy, cx, cy = camera
+    v, u = np.mgrid[: size[0], : size[1]]
+    light = sum(np.exp(-((u - fx * x / z - cx) ** 2 + (v - fy * y / z - cy) ** 2) / 18) for x, y, z in points)
+    return np.rint(220 * light).astype(np.uint8)[..., None]
+
+
+POINTS = [(-2.0, 0.3, 6.0), (1.0, -0.5, 5.0), (2.5, 0.4, 9.0)]
+MIRRORED = [(-x, y, z) for x, y, z in POINTS]
+
+
+@pytest.mark.parametrize("cx", [63.5, 63.0, 60.0, 60.8, 68.3])
+def test_mirror_shows_the_mirrored_world_to_the_same_camera(cx):
+    camera = (100.0, 95.0, cx, 30.0)
+    frame = blobs(camera, (64, 128), POINTS)
+    expected = blobs(camera, (64, 128), MIRRORED)
+    found = mirror_frame(frame, camera)
+    assert found.shape == frame.shape and found.dtype == np.uint8
+    # Between pixels the light is interpolated, which flattens the top of a blob a little.
+    np.testing.assert_allclose(found.astype(int), expected.astype(int), atol=4)
+    assert np.abs(found.astype(int) - frame).max() > 100
+
+
+@given(width=st.integers(6, 40), shift=st.integers(-5, 5))
+def test_mirroring_twice_gives_the_frame_back_where_it_is_covered(width, shift):
+    frame = np.random.default_rng(width).integers(0, 256, (3, width, 1), dtype=np.uint8)
+    camera = (9.0, 9.0, (width - 1 + shift) / 2, 1.0)  # whole pixels are exchanged for whole pixels
+    back = mirror_frame(mirror_frame(frame, camera), camera)
+    covered = slice(max(0, shift), width + min(0, shift))
+    np.testing.assert_array_equal(back[:, covered], frame[:, covered])
+
+
+def test_mirror_without_a_camera_flips_the_frame():
+    frame = np.random.default_rng(0).integers(0, 256, (6, 10, 3), dtype=np.uint8)
+    np.testing.assert_array_equal(mirror_frame(frame, None), frame[:, ::-1])
+    np.testing.assert_array_equal(mirror_frame(frame, (9.0, 9.0, 4.5, 2.5)), frame[:, ::-1])
+
+
+def test_mirror_repeats_the_edge_where_it_sees_past_it():
+    frame = np.tile(np.arange(10, dtype=np.uint8) * 20, (4, 1))[..., None]
+    found = mirror_frame(frame, (9.0, 9.0, 6.5, 1.5))
+    # Pixel u shows pixel 13 - u: the first four are past the right edge.
+    np.testing.assert_array_equal(found[2, :, 0], [180, 180, 180, 180, 180, 160, 140, 120, 100, 80])
+
+
+def draw(frames, seed, strength=1.0):
+    return photometric(frames, strength, np.random.default_rng(seed))
+
+
+def test_photometric_changes_the_window_as_one():
+    """The light differs much between windows, little between the frames of one, and noise less than that."""
+    frames = np.full((5, 60, 80, 3), 120, np.uint8)
+    windows = np.stack([draw(frames, seed) for seed in range(40)]).astype(float)
+    assert windows.dtype == float and draw(frames, 0).dtype == np.uint8 and draw(frames, 0).shape == frames.shape
+    of_windows = windows.mean((1, 2, 3, 4))
+    of_frames = windows.mean((2, 3, 4)) - of_windows[:, None]
+    assert 15 < of_windows.std() < 60
+    assert 0.5 < of_frames.std() < 8
+    assert 0.5 < np.median(windows.std((2, 3))) < 8
+    gentle = np.stack([draw(frames, seed, 0.1) for seed in range(40)]).astype(float)
+    assert 1 < gentle.mean((1, 2, 3, 4)).std() < 8
+
+
+def test_photometric_keeps_the_order_of_grey_levels():
+    ramp = np.tile(np.arange(256, dtype=np.uint8), (2, 64, 1))[..., None]
+    for seed in range(20):
+        curve = draw(ramp, seed)[0, :, :, 0].astype(float).mean(0)  # noise averages out
+        assert (np.diff(np.convolve(curve, np.ones(16) / 16, "valid")) > -0.6).all()
+
+
+def test_photometric_is_a_function_of_its_draw():
+    frames = np.random.default_rng(0).integers(0, 256, (3, 8, 10, 1), dtype=np.uint8)
+    before = frames.copy()
+    np.testing.assert_array_equal(draw(frames, 7), draw(frames, 7))
+    assert (draw(frames, 7) != draw(frames, 8)).any()
+    np.testing.assert_array_equal(frames, before)
+    np.testing.assert_array_equal(draw(frames, 7, 0.0), frames)
+
+
+def test_the_noise_of_two_frames_is_not_the_same():
+    frames = np.full((2, 40, 50, 1), 128, np.uint8)
+    first, second = draw(frames, 4, 2.0).astype(float)
+    assert first.std() > 1
+    assert abs(np.corrcoef(first.ravel(), second.ravel())[0, 1]) < 0.1
+
+
+def test_colours_are_toned_by_their_own_gain():
+    frames = np.full((1, 30, 30, 3), 128, np.uint8)
+    means = np.stack([draw(frames, seed).mean((0, 1, 2)) for seed in range(30)])
+    assert 1 < (means - means.mean(1, keepdims=True)).std() < 15

@@ -1,0 +1,111 @@
+import numpy as np
+import pytest
+
+from mdnvo_jax.config import Config, DataConfig, ImageConfig
+from mdnvo_jax.data import cache, load
+from mdnvo_jax.errors import InputError
+
+IMAGE = ImageConfig(height=20, width=62, channels=3)
+
+
+def config_of(root, image=IMAGE, **data):
+    return Config(image=image, data=DataConfig(root=str(root), **data))
+
+
+def test_the_tail_of_training_sequences_validates(kitti_root):
+    config = config_of(kitti_root, train_sequences=("00", "07"), validation_tail=0.25)
+    train, validation, image = load.load_split(config)
+    assert [(s.name, s.count) for s in train] == [("00", 9), ("07", 6)]
+    assert [(s.name, s.count) for s in validation] == [("00", 3), ("07", 2)]
+    assert image.camera == pytest.approx((72 * 0.5, 71 * 20 / 37, 61.2 * 0.5 - 0.5, 19 * 20 / 37 - 0.5))
+    assert train[0].read(8).shape == (37, 124, 3)
+
+
+def test_named_validation_sequences_validate(kitti_root):
+    config = config_of(kitti_root, train_sequences=("07",), validation_sequences=("00",), camera_folder="image_0")
+    train, validation, _ = load.load_split(config)
+    assert [(s.name, s.count) for s in train + validation] == [("07", 8), ("00", 12)]
+    np.testing.assert_allclose(train[0].poses[0], np.eye(4), atol=1e-6)
+
+
+def test_the_cache_takes_the_place_of_the_files(kitti_root, tmp_path):
+    config = config_of(kitti_root, train_sequences=("00", "07"))
+    train, validation, image = load.load_split(config)
+    cache.prepare_cache(load.kitti_sequences(("00", "07"), config), image, tmp_path / "c")
+    cached = load.load_split(config_of("", train_sequences=("00", "07"), cache=str(tmp_path / "c")))
+    assert cached[2] == image
+    for a, b in zip(train + validation, cached[0] + cached[1], strict=True):
+        assert (a.name, a.count) == (b.name, b.count)
+        np.testing.assert_array_equal(a.poses, b.poses)
+        assert b.read(0).shape == (20, 62, 3)
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        ({"train_sequences": ("00", "07"), "validation_sequences": ("07",)}, "sequences 07 are for training and valid"),
+        ({"train_sequences": ()}, "data.train_sequences is empty"),
+        ({"train_sequences": ("00", "00")}, "each name once"),
+        ({"train_sequences": ("09",)}, "no sequence 09"),
+        ({"dataset": "synthetic", "worlds": 0}, "data.worlds 0"),
+        ({"dataset": "synthetic", "validation_worlds": 0}, "data.validation_worlds 0"),
+    ],
+)
+def test_mistakes_are_named(kitti_root, data, message):
+    with pytest.raises(InputError, match=message):
+        load.load_split(config_of(kitti_root, **data))
+
+
+def test_a_raw_drive_is_read_as_one(raw_root):
+    name = "2011_09_26/2011_09_26_drive_0001_sync"
+    train, validation, image = load.load_split(config_of(raw_root, train_sequences=(name,), validation_tail=0.5))
+    assert [(s.name, s.count) for s in train + validation] == [(name, 2), (name, 2)]
+    assert image.camera == pytest.approx((35.0, 70 * 20 / 37, 60.5 / 2 - 0.5, 18.5 * 20 / 37 - 0.5))
+    with pytest.raises(InputError, match=r"camera folder 'left': expected a name such as image_2"):
+        load.load_split(config_of(raw_root, train_sequences=(name,), camera_folder="left"))
+
+
+def test_a_root_is_asked_for():
+    with pytest.raises(InputError, match=r"data.root is empty"):
+        load.load_split(config_of(""))
+
+
+@pytest.fixture
+def asked(toy, monkeypatch):
+    """Stand in for the renderer; note what is asked of it."""
+    notes = []
+
+    def drive(seed, frames, *, height, width, channels, camera):
+        notes.append((seed, frames, height, width, channels, camera))
+        return toy(frames, name=str(seed), camera=camera or (20.0, 20.0, 15.0, 8.0), size=(height, width))
+
+    monkeypatch.setattr("mdnvo_jax.data.synthetic.drive", drive)
+    return notes
+
+
+def test_synthetic_worlds_are_disjoint_by_seed(asked):
+    config = config_of("", dataset="synthetic", worlds=3, world_frames=7, validation_worlds=2)
+    train, validation, image = load.load_split(config)
+    assert asked == [(seed, 7, 20, 62, 3, None) for seed in (0, 1, 2, 1_000_000, 1_000_001)]
+    assert [s.name for s in train] == ["0", "1", "2"] and len(validation) == 2
+    assert image.camera == pytest.approx((20.0, 20.0, 15.0, 8.0))
+
+
+@pytest.mark.parametrize("rectify", [True, False])
+def test_synthetic_worlds_are_seen_by_the_virtual_camera(asked, rectify):
+    camera = (30.0, 31.0, 32.0, 9.0)
+    image = ImageConfig(height=20, width=62, channels=1, camera=camera, rectify=rectify)
+    load.synthetic_sequences([load.TEST_SEED], config_of("", image, world_frames=7))
+    assert asked == [(2_000_000, 7, 20, 62, 1, camera if rectify else None)]
+
+
+def test_a_real_renderer_takes_what_is_asked_of_it():
+    """Without rendering, which compiles for seconds and has tests of its own."""
+    camera = (30.0, 31.0, 32.0, 9.0)
+    image = ImageConfig(height=20, width=62, channels=1, camera=camera)
+    config = config_of("", image, dataset="synthetic", worlds=2, world_frames=5, validation_worlds=1)
+    train, validation, resolved = load.load_split(config)
+    assert resolved == image and [s.camera for s in train + validation] == [camera] * 3
+    assert all(s.count == 5 and s.poses.shape == (5, 4, 4) for s in train + validation)
+    labels = np.stack([s.steps() for s in train + validation])
+    assert (labels[0] != labels[1]).any() and (labels[0] != labels[2]).any()
