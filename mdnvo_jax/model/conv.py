@@ -1,0 +1,163 @@
+"""The convolution stack: nine layers as in FlowNetS and DeepVO, each with BatchNorm, LeakyReLU and dropout."""
+
+from typing import NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+
+class Layer(NamedTuple):
+    """One convolution: a square kernel of `kernel` pixels, `stride`, and its output `channels` at full width."""
+
+    name: str
+    kernel: int
+    stride: int
+    channels: int
+
+    @property
+    def padding(self) -> int:
+        """Rows and columns of zeros on every side. Explicit: SAME would pad a strided 7x7 by 2 and 3, FlowNet by 3."""
+        return (self.kernel - 1) // 2
+
+
+# FlowNetS (Dosovitskiy et al. 2015) up to conv6, which are the nine layers of DeepVO and of the MDN-VO paper.
+LAYERS = (
+    Layer("conv1", 7, 2, 64),
+    Layer("conv2", 5, 2, 128),
+    Layer("conv3", 5, 2, 256),
+    Layer("conv3_1", 3, 1, 256),
+    Layer("conv4", 3, 2, 512),
+    Layer("conv4_1", 3, 1, 512),
+    Layer("conv5", 3, 2, 512),
+    Layer("conv5_1", 3, 1, 512),
+    Layer("conv6", 3, 2, 1024),
+)
+
+# FlowNet's LeakyReLU; flax's own default is 0.01.
+LEAKY_SLOPE = 0.1
+# torch's defaults: running <- 0.9 running + 0.1 batch.
+BATCH_NORM_MOMENTUM = 0.9
+BATCH_NORM_EPSILON = 1e-5
+
+
+def layer_channels(layer: Layer, multiplier: float) -> int:
+    """Return the output channels of `layer` in a stack whose widths are scaled by `multiplier`; at least 1."""
+    return max(1, round(layer.channels * multiplier))
+
+
+def map_size(height: int, width: int) -> tuple[int, int]:
+    """Return rows and columns of the stack's output for images of `height` x `width` pixels."""
+    for layer in LAYERS:
+        height = (height + 2 * layer.padding - layer.kernel) // layer.stride + 1
+        width = (width + 2 * layer.padding - layer.kernel) // layer.stride + 1
+    return height, width
+
+
+def convolve(x: Array, kernel: Array, stride: int, padding: int) -> Array:
+    """Return the cross-correlation of `x` with `kernel`: the one place where the model convolves.
+
+    Args:
+      x: maps `[N, H, W, C]`.
+      kernel: weights `[kernel, kernel, C, D]`.
+      stride: step in pixels, the same in both directions.
+      padding: zeros added on each of the four sides.
+
+    Returns:
+      `[N, (H + 2 * padding - kernel) // stride + 1, ..., D]`.
+    """
+    return jax.lax.conv_general_dilated(
+        x,
+        kernel,
+        window_strides=(stride, stride),
+        padding=((padding, padding), (padding, padding)),
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+    )
+
+
+class Moments(NamedTuple):
+    """Mean and biased variance by channel `[C]` over the `pixels` that were not masked."""
+
+    mean: Array
+    variance: Array
+    pixels: Array
+
+
+def batch_moments(x: Array, mask: Array) -> Moments:
+    """Return the moments of maps `x` `[N, H, W, C]` over those with a true `mask` `[N]`; zeros where there are none."""
+    where = mask[:, None, None, None]
+    pixels = mask.sum() * (x.shape[1] * x.shape[2])
+    divisor = jnp.maximum(pixels, 1).astype(x.dtype)
+    mean = jnp.sum(x, axis=(0, 1, 2), where=where) / divisor
+    # Two passes: the mean of squares minus the square of the mean loses digits where the mean is large.
+    variance = jnp.sum(jnp.square(x - mean), axis=(0, 1, 2), where=where) / divisor
+    return Moments(mean, variance, pixels)
+
+
+class ConvBlock(nn.Module):
+    """Convolution without bias, BatchNorm, LeakyReLU, dropout.
+
+    The BatchNorm is that of torch: the batch is normalised with its biased variance, while the running variance takes
+    the unbiased one. (`flax.linen.BatchNorm` keeps the biased one, and its statistics are NaN for a batch whose maps
+    are all masked; here such a batch is normalised with the running statistics, and leaves them alone.)
+
+    Parameters are kernel `[k, k, C, D]`, scale `[D]` and bias `[D]`; batch statistics are mean `[D]` and var `[D]`.
+    """
+
+    layer: Layer
+    channels: int
+    dropout: float
+
+    @nn.compact
+    def __call__(self, x: Array, mask: Array, *, train: bool) -> Array:
+        """Return `[N, h, w, channels]` for maps `[N, H, W, C]`; `mask` `[N]` marks those that count in statistics."""
+        size = self.layer.kernel
+        kernel = self.param("kernel", nn.initializers.glorot_uniform(), (size, size, x.shape[-1], self.channels))
+        scale = self.param("scale", nn.initializers.ones, (self.channels,))
+        bias = self.param("bias", nn.initializers.zeros, (self.channels,))
+        running_mean = self.variable("batch_stats", "mean", jnp.zeros, (self.channels,))
+        running_variance = self.variable("batch_stats", "var", jnp.ones, (self.channels,))
+
+        x = convolve(x, kernel, self.layer.stride, self.layer.padding)
+        mean, variance = running_mean.value, running_variance.value
+        if train:
+            batch = batch_moments(x, mask)
+            filled = batch.pixels > 0
+            unbiased = batch.variance * (batch.pixels / jnp.maximum(batch.pixels - 1, 1))
+            running_mean.value = jnp.where(filled, _blend(mean, batch.mean), mean)
+            running_variance.value = jnp.where(filled, _blend(variance, unbiased), variance)
+            mean = jnp.where(filled, batch.mean, mean)
+            variance = jnp.where(filled, batch.variance, variance)
+        x = (x - mean) * (scale * jax.lax.rsqrt(variance + BATCH_NORM_EPSILON)) + bias
+        x = nn.leaky_relu(x, LEAKY_SLOPE)
+        return nn.Dropout(self.dropout)(x, deterministic=not train)
+
+
+def _blend(running: Array, batch: Array) -> Array:
+    """Return the running statistic after one more batch."""
+    return (BATCH_NORM_MOMENTUM * running + (1 - BATCH_NORM_MOMENTUM) * batch).astype(running.dtype)
+
+
+class ConvStack(nn.Module):
+    """The nine blocks of `LAYERS`, with channels scaled by `multiplier` and dropout of rate `dropout` after each."""
+
+    multiplier: float
+    dropout: float
+
+    @nn.compact
+    def __call__(self, pairs: Array, mask: Array, *, train: bool) -> Array:
+        """Return the maps of frame pairs.
+
+        Args:
+          pairs: two frames stacked on channels, normalised, `[N, H, W, 2 * C]`.
+          mask: `[N]`, false for pairs that are padding: they do not enter the batch statistics.
+          train: whether to drop units, normalise with the batch and update the collection "batch_stats".
+
+        Returns:
+          `[N, h, w, D]` with h, w of `map_size` and D = 1024 * multiplier.
+        """
+        for layer in LAYERS:
+            channels = layer_channels(layer, self.multiplier)
+            pairs = ConvBlock(layer, channels, self.dropout, name=layer.name)(pairs, mask, train=train)
+        return pairs
