@@ -10,13 +10,14 @@ __version__ = "0.1.0"
 
 _HOME = {
     "Trajectory": "mdnvo_jax.odometry",
-    "load": "mdnvo_jax.odometry",
-    "predict": "mdnvo_jax.odometry",
+    "load": "mdnvo_jax.predictor",
+    "predict": "mdnvo_jax.predictor",
 }
 __all__ = ["Trajectory", "__version__", "load", "predict"]
 
 if TYPE_CHECKING:
-    from mdnvo_jax.odometry import Trajectory, load, predict
+    from mdnvo_jax.odometry import Trajectory
+    from mdnvo_jax.predictor import load, predict
 
 
 def __getattr__(name: str) -> Any:

@@ -4,8 +4,12 @@ import os
 import tempfile
 from pathlib import Path
 
+import hypothesis
 import pytest
 
+# How long an example takes says more about the machine's load than about the code.
+hypothesis.settings.register_profile("mdnvo", deadline=None)
+hypothesis.settings.load_profile("mdnvo")
 
 # Programs that several tests and the processes they start compile alike are compiled once.
 _CACHE = tempfile.TemporaryDirectory(prefix="mdnvo-test-cache-")

@@ -62,7 +62,7 @@ class Store:
             int(state.step),
             args=ocp.args.Composite(
                 model=ocp.args.StandardSave(state.model),
-                training=ocp.args.StandardSave(state._replace(model=None)._asdict()),
+                training=ocp.args.StandardSave(_without_model(state)),
                 data=ocp.args.JsonSave({"iterator": data_state}),
                 about=ocp.args.JsonSave({"version": VERSION, "config": json.loads(configuration.as_json(config))}),
             ),
@@ -88,7 +88,7 @@ class Store:
                     step,
                     args=ocp.args.Composite(
                         model=ocp.args.StandardRestore(template.model),
-                        training=ocp.args.StandardRestore(template._replace(model=None)._asdict()),
+                        training=ocp.args.StandardRestore(_without_model(template)),
                         data=ocp.args.JsonRestore(),
                     ),
                 )
@@ -97,7 +97,7 @@ class Store:
                     f"warning: checkpoint {step} cannot be read, trying an older one ({_first(error)})", file=sys.stderr
                 )
                 continue
-            state = State(**{**found.training, "model": found.model})
+            state = State(model=found.model, **found.training)
             return Restored(state, found.data["iterator"], step)
         raise InputError(f"no readable checkpoint in {self._manager.directory}: start again without --resume")
 
@@ -108,6 +108,11 @@ class Store:
     def close(self) -> None:
         """Finish what is being written and let go."""
         self._manager.close()
+
+
+def _without_model(state: State) -> dict[str, Any]:
+    """Return the part of a state that only training needs; the model is saved beside it, for prediction to read."""
+    return {name: value for name, value in state._asdict().items() if name != "model"}
 
 
 def _metric(metrics: dict[str, float]) -> float:
@@ -180,10 +185,22 @@ def read_model(step_folder: Path, template: Model) -> Model:
     Raises:
       InputError: it is damaged or its shapes are not those of `template`.
     """
-    with ocp.Checkpointer(ocp.StandardCheckpointHandler()) as reader:
-        try:
+    try:
+        # Orbax notices a wrong shape too, but late, and leaves half-done reads behind.
+        stored = _shapes(ocp.StandardCheckpointHandler().metadata(step_folder / "model").tree)
+        expected = _shapes(template)
+        wrong = sorted(name for name in stored.keys() | expected.keys() if stored.get(name) != expected.get(name))
+        if wrong:
+            raise ValueError(f"{wrong[0]} is {stored.get(wrong[0])}, expected {expected.get(wrong[0])}")
+        with ocp.Checkpointer(ocp.StandardCheckpointHandler()) as reader:
             return reader.restore(step_folder / "model", args=ocp.args.StandardRestore(template))
-        except _DAMAGE as error:
-            raise InputError(
-                f"the checkpoint {step_folder} is damaged or does not fit its own configuration ({_first(error)})"
-            ) from error
+    except _DAMAGE as error:
+        raise InputError(
+            f"the checkpoint {step_folder} is damaged or does not fit its own configuration ({_first(error)})"
+        ) from error
+
+
+def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:
+    """Return the shape of every leaf by its path."""
+    leaves = jax.tree.leaves_with_path(tree)
+    return {jax.tree_util.keystr(path, simple=True, separator="."): tuple(leaf.shape) for path, leaf in leaves}

@@ -99,7 +99,7 @@ def train(config: Config, workdir: Path, *, resume: bool = False) -> str:
         state = restored.state
         batches.set_state(restored.data_state)
     else:
-        labels = Labels(*label_statistics(train_set, config.data))
+        labels = Labels(*map(jax.numpy.asarray, label_statistics(train_set, config.data)))
         state = jax.device_put(initial_state(_first_variables(network, config), config, labels), everywhere)
         _describe(workdir, config, labels)
     run = _Run(config, workdir, network, mesh, store, steps_per_epoch, int(state.step))
@@ -140,7 +140,15 @@ def _check_same(config: Config, workdir: Path) -> None:
 def _first_variables(network: Network, config: Config) -> Any:
     """Return the variables to start from, with the stack's weights from a file where the config names one."""
     variables = initial_variables(network, config)
-    return load_stack(config.training.initial_stack, variables) if config.training.initial_stack else variables
+    if not config.training.initial_stack:
+        return variables
+    if config.image.normalisation != "flownet":
+        print(
+            f"warning: image.normalisation is {config.image.normalisation!r}: FlowNet's weights were trained on frames "
+            "normalised by 'flownet'",
+            file=sys.stderr,
+        )
+    return load_stack(config.training.initial_stack, variables)
 
 
 def _describe(workdir: Path, config: Config, labels: Labels) -> None:

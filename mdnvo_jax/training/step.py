@@ -18,7 +18,9 @@ Batch = dict[str, jax.Array]
 Metrics = dict[str, jax.Array]
 
 
-def objective(outputs: jax.Array, batch: Batch, labels: Labels, config: Config, reduction: str) -> jax.Array:
+def objective(
+    outputs: jax.Array, batch: Batch, labels: Labels, config: Config, reduction: mixture.Reduction
+) -> jax.Array:
     """Return the loss of the network's outputs `[B, T, D]`: a NLL in metres and radians, or DeepVO's squared error."""
     steps, mask = batch["steps"], batch["mask"]
     if config.model.head == "regression":

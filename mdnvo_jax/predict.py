@@ -1,0 +1,70 @@
+"""Estimate a trajectory with covariance: `python -m mdnvo_jax.predict IMAGES --checkpoint DIR --output DIR`."""
+
+import json
+import shlex
+import sys
+from collections.abc import Iterator, Sequence
+from typing import Any
+
+from mdnvo_jax import files
+from mdnvo_jax.errors import InputError, Parser, exit_code
+
+
+def main(arguments: Sequence[str]) -> None:
+    """Predict as the command line says."""
+    parser = Parser("python -m mdnvo_jax.predict", description="Estimate a trajectory with covariance from images.")
+    parser.add_argument("images", metavar="IMAGES", help="a folder, a glob in quotes, a video, or a KITTI sequence")
+    parser.add_argument("--checkpoint", required=True, metavar="DIR", help="the --workdir of a training")
+    parser.add_argument("--output", required=True, metavar="DIR", help="the files are written here")
+    parser.add_argument("--force", action="store_true", help="overwrite files in --output")
+    parser.add_argument("--stride", type=int, default=1, metavar="N", help="use every Nth frame")
+    parser.add_argument("--timestamps", metavar="FILE", help="a time in seconds a line, one for each frame")
+    parser.add_argument("--camera", type=_camera, metavar="fx,fy,cx,cy", help="intrinsics of the frames in pixels")
+    parser.add_argument("--mode", choices=("offline", "streaming"), default="offline", help="streaming: past alone")
+    parser.add_argument("--bad-frames", choices=("stop", "hold"), default="stop", help="what an unreadable frame does")
+    parser.add_argument(
+        "--estimate", choices=("mean", "strongest"), default="mean", help="what a mixture is reported by"
+    )
+    options = parser.parse_args(arguments)
+    if options.stride < 1:
+        raise InputError(f"--stride is {options.stride}: expected 1 or more")
+    output = files.claim_output(options.output, force=options.force)
+
+    from mdnvo_jax import predictor
+    from mdnvo_jax.data.folder import read_frames
+    from mdnvo_jax.training import logs
+
+    def bar(chunks: Iterator[Any], total: int) -> Iterator[Any]:
+        return logs.track(chunks, "predicting", total)
+
+    model = predictor.load(options.checkpoint)
+    frames = read_frames(
+        options.images,
+        model.config.image.channels,
+        stride=options.stride,
+        timestamps=options.timestamps,
+        camera=options.camera,
+    )
+    path = predictor.predict(
+        model, frames, mode=options.mode, bad_frames=options.bad_frames, estimate=options.estimate, progress=bar
+    )
+    path.about.update(command=shlex.join(sys.orig_argv), versions=logs.versions())
+    path.save(output, force=True)
+    print(
+        f"{len(path.poses)} frames, {path.distance_m:.1f} m, {sum(map(bool, path.flags))} steps flagged, "
+        f"ms a frame {json.dumps(path.about['ms_per_frame'])}; the files are in {output}"
+    )
+
+
+def _camera(text: str) -> tuple[float, ...]:
+    """Return the four intrinsics in `text`."""
+    values = tuple(float(value) for value in text.split(","))
+    if len(values) != 4:
+        raise ValueError
+    return values
+
+
+_camera.__name__ = "fx,fy,cx,cy"  # argparse names the type in its complaint
+
+if __name__ == "__main__":
+    raise SystemExit(exit_code(main))

@@ -1,0 +1,133 @@
+"""From densities of steps to a trajectory and its files."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from mdnvo_jax import geometry, odometry
+from mdnvo_jax.errors import InputError
+from mdnvo_jax.mixture import Mixture
+
+
+def densities(count: int, components: int = 2, seed: int = 0) -> Mixture:
+    generator = np.random.default_rng(seed)
+    mean = np.array([0, 0, 1, 0, 0.03, 0]) + 0.01 * generator.normal(size=(count, components, 6))
+    return Mixture(
+        generator.normal(size=(count, components)), mean, np.log(generator.uniform(0.005, 0.02, (count, components, 6)))
+    )
+
+
+@given(st.integers(1, 60), st.integers(1, 12), st.integers(1, 12))
+def test_every_step_comes_once_and_from_the_window_that_sees_most_around_it(count: int, window: int, hop: int) -> None:
+    hop = min(hop, window)
+    plan = list(odometry.window_plan(count, window, hop))
+    assert [step for _, first, last in plan for step in range(first, last)] == list(range(count))
+    starts = [start for start, _, _ in plan]
+    assert starts[0] == 0
+    assert starts == sorted(set(starts))
+    for start, first, last in plan:
+        assert start <= first <= last <= start + window
+        for step in range(first, last):
+            off_centre = [abs(step - other - (window - 1) / 2) for other in starts]
+            assert abs(step - start - (window - 1) / 2) == min(off_centre)
+
+
+def test_the_trajectory_composes_the_means_and_their_covariance() -> None:
+    steps = densities(30)
+    path = odometry.trajectory(steps, coupling="joint")
+    weights = np.exp(steps.logits) / np.exp(steps.logits).sum(-1, keepdims=True)
+    means = (weights[..., None] * steps.mean).sum(1)
+    np.testing.assert_allclose(path.steps, means, rtol=1e-5, atol=1e-7)
+    pose = np.eye(4)
+    np.testing.assert_array_equal(path.poses[0], pose)
+    for index, step in enumerate(geometry.step_to_matrix(path.steps), start=1):
+        pose = pose @ step
+        np.testing.assert_allclose(path.poses[index], pose, atol=1e-12)
+    # Law of total variance, by hand.
+    variance = (weights[..., None] * (np.exp(2 * steps.log_scale) + (steps.mean - means[:, None]) ** 2)).sum(1)
+    np.testing.assert_allclose(path.sigma, np.sqrt(variance), rtol=1e-4)
+    assert not path.covariance[0].any()
+    # On a path that hardly bends, the variance along z grows by that of every step.
+    assert np.all(np.linalg.eigvalsh(path.covariance[1:]) > 0)
+    assert np.all(np.diff(np.trace(path.covariance, axis1=1, axis2=2)) > 0)
+    np.testing.assert_allclose(path.distance_m, np.linalg.norm(means[:, :3], axis=1).sum(), rtol=1e-5)
+
+
+def test_the_strongest_component_can_be_reported() -> None:
+    steps = densities(5)
+    path = odometry.trajectory(steps, coupling="independent", estimate="strongest")
+    best = steps.logits.argmax(-1)
+    np.testing.assert_allclose(path.steps, steps.mean[np.arange(5), best], rtol=1e-6)
+    np.testing.assert_allclose(path.sigma, np.exp(steps.log_scale[np.arange(5), best]), rtol=1e-5)
+
+
+def test_a_monte_carlo_over_the_steps_has_the_covariance_that_is_told() -> None:
+    generator = np.random.default_rng(1)
+    count, draws = 20, 4000
+    scale = np.array([0.01, 0.01, 0.03, 0.002, 0.01, 0.002])
+    mean = np.tile([0, 0, 1, 0, 0.05, 0], (count, 1)).astype(float)
+    steps = Mixture(np.zeros((count, 1)), mean[:, None], np.tile(np.log(scale), (count, 1, 1)))
+    path = odometry.trajectory(steps, coupling="joint")
+    samples = np.tile(np.eye(4), (draws, 1, 1))
+    for index in range(count):
+        samples = samples @ geometry.step_to_matrix(mean[index] + scale * generator.normal(size=(draws, 6)))
+    errors = geometry.log_se3(geometry.inverse(path.poses[-1]) @ samples)
+    np.testing.assert_allclose(np.cov(errors.T), path.covariance[-1], atol=0.05 * np.abs(path.covariance[-1]).max())
+
+
+def test_the_files_hold_the_trajectory(tmp_path: Path) -> None:
+    path = odometry.trajectory(
+        densities(12), coupling="joint", timestamps=100 + 0.1 * np.arange(13), flags=["held"] + [""] * 11
+    )
+    path.save(tmp_path / "out")
+    names = {entry.name for entry in (tmp_path / "out").iterdir()}
+    assert names == {
+        "trajectory_kitti.txt",
+        "trajectory_tum.txt",
+        "steps.csv",
+        "covariance.csv",
+        "mixture.npz",
+        "trajectory.png",
+        "uncertainty.png",
+        "summary.json",
+    }
+    kitti = np.loadtxt(tmp_path / "out" / "trajectory_kitti.txt")
+    np.testing.assert_allclose(kitti.reshape(13, 3, 4), path.poses[:, :3], atol=1e-8)
+    tum = np.loadtxt(tmp_path / "out" / "trajectory_tum.txt")
+    np.testing.assert_allclose(tum[:, 0], path.timestamps)
+    np.testing.assert_allclose(tum[:, 1:4], path.poses[:, :3, 3], atol=1e-8)
+    np.testing.assert_allclose(geometry.matrix_from_quaternion(tum[:, 4:]), path.poses[:, :3, :3], atol=1e-7)
+    with (tmp_path / "out" / "steps.csv").open(newline="") as stream:
+        rows = list(csv.DictReader(stream))
+    names = ["tx", "ty", "tz", "rx", "ry", "rz"]
+    assert list(rows[0]) == ["frame", "timestamp", *names, *(f"sigma_{n}" for n in names), "log_density_peak", "flags"]
+    assert [row["frame"] for row in rows] == [str(frame) for frame in range(1, 13)]
+    np.testing.assert_allclose([[float(row[name]) for name in names] for row in rows], path.steps, rtol=1e-8)
+    np.testing.assert_allclose([[float(row[f"sigma_{n}"]) for n in names] for row in rows], path.sigma, rtol=1e-8)
+    assert [row["flags"] for row in rows] == ["held"] + [""] * 11
+    with (tmp_path / "out" / "covariance.csv").open(newline="") as stream:
+        covariance = np.array([[float(value) for value in row] for row in list(csv.reader(stream))[1:]])
+    assert covariance.shape == (13, 1 + 21 + 21)
+    upper = np.triu_indices(6)
+    np.testing.assert_allclose(covariance[:, 1:22], path.covariance[:, *upper], rtol=1e-8)
+    np.testing.assert_allclose(covariance[1:, 22:], path.step_covariance[:, *upper], rtol=1e-8)
+    with np.load(tmp_path / "out" / "mixture.npz", allow_pickle=False) as stored:
+        np.testing.assert_array_equal(stored["mean"], path.mixture.mean)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["frames"] == 13
+    assert summary["flagged_steps"] == 1
+
+
+def test_results_are_not_overwritten_by_accident(tmp_path: Path) -> None:
+    path = odometry.trajectory(densities(3), coupling="joint")
+    (tmp_path / "mine.txt").write_text("precious")
+    with pytest.raises(InputError, match="--force"):
+        path.save(tmp_path)
+    assert [entry.name for entry in tmp_path.iterdir()] == ["mine.txt"]
+    path.save(tmp_path, force=True)
+    assert (tmp_path / "mine.txt").read_text() == "precious"
