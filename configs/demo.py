@@ -1,6 +1,7 @@
-"""A tiny network on a few rendered drives: the whole pipeline in two minutes, for `bin/demo`.
+"""A tiny network on a few rendered drives: the whole pipeline in a few minutes, for `bin/demo`.
 
-    python -m mdnvo_jax.train configs/demo.py --workdir demo/train
+    python -m mdnvo_jax.synthesize drives --sequences 24 --frames 60 --seed 0 --height 48 --width 160
+    python -m mdnvo_jax.train configs/demo.py --workdir train --data.root drives
 
 It learns to tell a bend from a straight road and fast from slow, and no more: do not expect it to work on real frames.
 """
@@ -10,6 +11,13 @@ from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig, Train
 config = Config(
     image=ImageConfig(height=48, width=160, channels=1, normalisation="local_contrast"),
     model=ModelConfig(width=0.125, lstm_hidden=64, lstm_layers=1, coupling="joint"),
-    data=DataConfig(dataset="synthetic", worlds=24, world_frames=40, validation_worlds=4, window=6, mirror=0.5),
-    training=TrainingConfig(batch_size=8, epochs=4, reduction="mean"),
+    data=DataConfig(
+        camera_folder="image_0",
+        train_sequences=tuple(f"{number:02d}" for number in range(24)),
+        window=6,
+        hop=2,
+        mirror=0.5,
+        photometric=0.5,
+    ),
+    training=TrainingConfig(batch_size=8, epochs=8, reduction="mean"),
 )

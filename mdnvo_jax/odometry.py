@@ -202,5 +202,6 @@ def _summary(path: Trajectory) -> dict[str, Any]:
         "end_sigma": dict(zip(COMPONENTS, end_sigma.tolist(), strict=True)),
         "median_step_sigma": dict(zip(COMPONENTS, np.median(path.sigma, axis=0).tolist(), strict=True)),
         "flagged_steps": sum(bool(flag) for flag in path.flags),
+        "coupling": path.coupling,
         **path.about,
     }

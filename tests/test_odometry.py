@@ -121,6 +121,7 @@ def test_the_files_hold_the_trajectory(tmp_path: Path) -> None:
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["frames"] == 13
     assert summary["flagged_steps"] == 1
+    assert summary["coupling"] == "joint"
 
 
 def test_results_are_not_overwritten_by_accident(tmp_path: Path) -> None:

@@ -1,0 +1,180 @@
+"""A trained model on sequences with known poses: what `evaluate model` does."""
+
+import argparse
+import dataclasses
+import functools
+from collections.abc import Iterator
+from collections.abc import Sequence as Many
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mdnvo_jax.baselines import constant
+from mdnvo_jax.errors import InputError
+from mdnvo_jax.evaluation import calibration_tables as tabled
+from mdnvo_jax.evaluation import scoring
+from mdnvo_jax.evaluation.association import Paired
+from mdnvo_jax.evaluation.calibration import StepScores
+from mdnvo_jax.evaluation.calibration_tables import CalibrationRow
+from mdnvo_jax.evaluation.compare import CONSTANT, MeanStep, constant_score, true_steps
+from mdnvo_jax.evaluation.formats import PoseFile
+from mdnvo_jax.evaluation.report import CalibrationPictures, PathPicture, Report, UncertaintyPicture
+from mdnvo_jax.evaluation.scoring import PathScore
+from mdnvo_jax.odometry import Trajectory
+
+if TYPE_CHECKING:
+    from mdnvo_jax.config import Config
+    from mdnvo_jax.data.sequence import Sequence
+
+# The split of the rows over all sequences.
+_ALL = "all"
+_ROOTS = {"kitti": "KITTI, which holds sequences/ and poses/", "nuscenes": "nuScenes, which holds samples/ and sweeps/"}
+
+
+@dataclasses.dataclass(frozen=True)
+class Predicted:
+    """What a model says of one sequence: its name, the prediction, and the true poses `[N, 4, 4]` of every frame."""
+
+    name: str
+    trajectory: Trajectory
+    truth: np.ndarray
+
+
+def from_options(options: argparse.Namespace) -> Report:
+    """Predict and judge as the options of `evaluate model` say.
+
+    Raises:
+      InputError: an option, the checkpoint or the data is unusable.
+    """
+    from mdnvo_jax import predictor
+
+    if options.block < 1:
+        raise InputError(f"--block is {options.block}: expected 1 frame or more")
+    model = predictor.load(options.checkpoint)
+    predicted = []
+    for sequence in _sequences(options, model.config):
+        if sequence.poses is None or sequence.count < 2:
+            raise InputError(f"sequence {sequence.name} has no poses of two frames: there is nothing to judge against")
+        bar = functools.partial(_track, name=sequence.name)
+        path = predictor.predict(model, sequence, mode=options.mode, estimate=options.estimate, progress=bar)
+        predicted.append(Predicted(sequence.name, path, sequence.poses))
+    labels = model.model.labels
+    step = MeanStep(np.asarray(labels.mean, float), np.asarray(labels.std, float), "mean step of the training split")
+    return evaluate(f"model ({options.mode}, {options.estimate})", predicted, step, block=options.block)
+
+
+def evaluate(name: str, predicted: Many[Predicted], constant_step: MeanStep, *, block: int) -> Report:
+    """Judge predictions, with the constant predictor beside them, by sequence and over all sequences.
+
+    Args:
+      name: of the method, in tables.
+      predicted: of each sequence.
+      constant_step: mean and deviation of the training split's steps.
+      block: frames in a bootstrap block.
+    """
+    pairs = [_score(name, item, constant_step) for item in predicted]
+    rows: list[CalibrationRow] = []
+    if len(predicted) > 1:
+        for item in predicted:
+            rows += _calibrations(name, item.name, [item], constant_step, block)[0]
+        model_scores, floors = zip(*pairs, strict=True)
+        pairs.append((scoring.pool(model_scores, _ALL), scoring.pool(floors, _ALL)))
+    split = _ALL if len(predicted) > 1 else predicted[0].name
+    found, scores = _calibrations(name, split, predicted, constant_step, block)
+    rows += found
+    entries = [entry for score, floor in pairs for entry in ((score, floor), (floor, None))]
+    table, summaries = scoring.comparison("Pose error", entries, [f"{CONSTANT}: {constant_step.source}"], block=block)
+    sequences = ", ".join(item.name for item in predicted)
+    return Report(
+        [table, tabled.calibration_table(rows)],
+        [*scoring.segment_tables(summaries), tabled.component_table(rows)],
+        {"paths": summaries, "calibration": [tabled.calibration_data(row) for row in rows]},
+        [
+            PathPicture(
+                f"trajectory-{_safe(item.name)}.png",
+                f"Path from above, split {item.name}, no alignment but of the first pose",
+                {name: score.poses},
+                item.truth,
+            )
+            for item, (score, _) in zip(predicted, pairs, strict=False)
+        ],
+        [CalibrationPictures("", f"{name}, split {sequences}, sigma of the whole mixture, no alignment", scores)],
+        [
+            UncertaintyPicture(
+                f"uncertainty-{_safe(item.name)}.png",
+                f"Steps of {name}, split {item.name}, with 3-sigma bands (no alignment)",
+                item.trajectory,
+                true_steps(item.truth),
+            )
+            for item in predicted
+        ],
+    )
+
+
+def _score(name: str, item: Predicted, constant_step: MeanStep) -> tuple[PathScore, PathScore]:
+    """Judge a prediction of one sequence, and the constant predictor on it."""
+    frames = np.arange(len(item.truth))
+    paired = Paired(item.trajectory.poses, item.truth, frames, frames, frames, "row")
+    reference = PoseFile(item.name, "kitti", item.truth)
+    floor = constant_score(constant_step, reference, item.name, "none", delta=1, unit="frames")
+    return scoring.score_path(name, item.name, paired, "none"), floor
+
+
+def _track(chunks: Iterator[Any], total: int, *, name: str) -> Iterator[Any]:
+    """Show how far the prediction of a sequence is."""
+    from mdnvo_jax.training import logs
+
+    return logs.track(chunks, f"predicting {name}", total)
+
+
+def _calibrations(
+    name: str, split: str, predicted: Many[Predicted], step: MeanStep, block: int
+) -> tuple[list[CalibrationRow], StepScores]:
+    """Calibrate the model and the constant predictor; the scores are those of the model's whole mixture."""
+    truths = [true_steps(item.truth) for item in predicted]
+    frames = sum(len(item.truth) for item in predicted)
+    rows, scores = tabled.calibration_rows(
+        name,
+        split,
+        [(item.trajectory.mixture, truth) for item, truth in zip(predicted, truths, strict=True)],
+        coupling=predicted[0].trajectory.coupling,
+        frames=(frames, frames),
+        block=block,
+    )
+    floor, _ = tabled.calibration_rows(
+        CONSTANT,
+        split,
+        [(constant.constant_mixture(step.mean, step.std, len(truth)), truth) for truth in truths],
+        coupling="independent",
+        frames=(frames, frames),
+        block=block,
+    )
+    return [*rows, *floor], scores[0]
+
+
+def _sequences(options: argparse.Namespace, config: "Config") -> list["Sequence"]:
+    """Return the sequences to judge on."""
+    from mdnvo_jax.data import load
+
+    if options.dataset == "synthetic":
+        wrong = [name for name in options.sequences if not name.isdecimal()]
+        if wrong:
+            raise InputError(f"--sequences {wrong[0]}: expected seeds of worlds, such as {load.TEST_SEED}")
+        return load.synthetic_sequences([int(name) for name in options.sequences], config)
+    if not options.root:
+        raise InputError(f"--root is missing: give the folder of {_ROOTS[options.dataset]}")
+    given = {"camera_folder": options.camera_folder, "version": options.nuscenes_version}
+    data = dataclasses.replace(
+        config.data,
+        dataset=options.dataset,
+        root=options.root,
+        cache="",
+        **{name: value for name, value in given.items() if value},
+    )
+    read = load.nuscenes_sequences if options.dataset == "nuscenes" else load.kitti_sequences
+    return read(options.sequences, dataclasses.replace(config, data=data))
+
+
+def _safe(name: str) -> str:
+    """Return a sequence's name as part of a file name."""
+    return name.replace("/", "_")

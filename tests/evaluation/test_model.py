@@ -1,0 +1,137 @@
+"""A model judged on sequences: from a checkpoint and frames to tables and pictures."""
+
+import json
+
+import cv2
+import numpy as np
+import pytest
+
+from mdnvo_jax import evaluate as command
+from mdnvo_jax import geometry, odometry
+from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig
+from mdnvo_jax.errors import exit_code
+from mdnvo_jax.evaluation import model
+from mdnvo_jax.evaluation.compare import MeanStep
+from mdnvo_jax.mixture import Mixture
+from mdnvo_jax.model.head import Labels
+from mdnvo_jax.model.network import build
+from mdnvo_jax.training import checkpoint
+from mdnvo_jax.training.state import initial_state, initial_variables
+
+CONFIG = Config(
+    image=ImageConfig(height=32, width=64, channels=1),
+    model=ModelConfig(width=1 / 16, lstm_hidden=4, lstm_layers=1, components=2),
+    data=DataConfig(window=3, camera_folder="image_0"),
+)
+LABELS = Labels(np.array([0, 0, 1, 0, 0.01, 0]), np.array([0.02, 0.02, 0.5, 0.005, 0.02, 0.005]))
+MEAN_STEP = MeanStep(np.array([0, 0, 1, 0, 0, 0.0]), np.array([0.1] * 3 + [0.01] * 3), "training")
+
+
+def prediction(name, steps, sigma, seed):
+    """A drive whose steps are predicted with exactly the sigma they have."""
+    rng = np.random.default_rng(seed)
+    truth = np.tile([0.0, 0, 1, 0, 0.01, 0], (steps, 1))
+    truth[:, 2] += 0.3 * np.sin(np.arange(steps) / 20)
+    scale = np.tile([sigma] * 3 + [sigma / 50] * 3, (steps, 1))
+    mean = truth + scale * rng.standard_normal((steps, 6))
+    matrices = geometry.step_to_matrix(mean)
+    path = odometry.Trajectory(
+        poses=geometry.accumulate(matrices),
+        covariance=np.zeros((steps + 1, 6, 6)),
+        steps=mean,
+        step_covariance=scale[:, :, None] ** 2 * np.eye(6),
+        timestamps=np.arange(steps + 1.0),
+        flags=[""] * steps,
+        mixture=Mixture(np.zeros((steps, 1)), mean[:, None], np.log(scale)[:, None]),
+        coupling="independent",
+    )
+    return model.Predicted(name, path, geometry.accumulate(geometry.step_to_matrix(truth)))
+
+
+def test_each_sequence_and_all_of_them_have_rows_for_both_methods():
+    items = [prediction(name, steps, 0.02, seed) for seed, (name, steps) in enumerate([("03", 150), ("a/05", 90)])]
+    found = model.evaluate("model", items, MEAN_STEP, block=10)
+    errors, calibration = found.tables
+    named = [(row["name"], row["split"]) for row in errors.rows]
+    assert named == [(name, split) for split in ("03", "a/05", "all") for name in ("model", "constant predictor")]
+    assert [(row["name"], row["split"]) for row in calibration.rows] == named
+    assert errors.rows[4]["frames"] == "242 of 242" and calibration.rows[4]["frames"] == "242 of 242"
+    assert errors.rows[4]["rmse"].value == pytest.approx(0.02 * np.sqrt(3), rel=0.15)
+    assert found.results["calibration"][4]["steps"] == 240
+    assert calibration.rows[4]["nees"].value == pytest.approx(6, abs=0.8)
+    assert calibration.rows[4]["nll"].value < calibration.rows[5]["nll"].value
+    assert errors.rows[4]["gain"].high < 0
+    assert [picture.file for picture in found.pictures] == ["trajectory-03.png", "trajectory-a_05.png"]
+    assert len(found.uncertainty) == 2 and len(found.calibration[0].scores.nll) == 240
+
+
+def test_one_sequence_needs_no_row_over_all():
+    found = model.evaluate("model", [prediction("03", 40, 0.02, 0)], MEAN_STEP, block=10)
+    assert [row["split"] for row in found.tables[0].rows] == ["03", "03"]
+    assert [row["split"] for row in found.tables[1].rows] == ["03", "03"]
+
+
+@pytest.fixture(scope="module")
+def workdir(tmp_path_factory):
+    """An untrained model, saved as a training would."""
+    folder = tmp_path_factory.mktemp("model")
+    state = initial_state(initial_variables(build(CONFIG.image, CONFIG.model), CONFIG), CONFIG, LABELS)
+    store = checkpoint.Store(folder, keep_latest=1)
+    store.save(state, None, CONFIG, 1.0)
+    store.close()
+    return folder
+
+
+@pytest.fixture(scope="module")
+def root(tmp_path_factory):
+    """Two drives in KITTI's layout, one of them without poses."""
+    folder = tmp_path_factory.mktemp("kitti")
+    (folder / "poses").mkdir()
+    for name in ("06", "11"):
+        images = folder / "sequences" / name / "image_0"
+        images.mkdir(parents=True)
+        (folder / "sequences" / name / "calib.txt").write_text("P0: 40 0 31.5 0 0 40 15.5 0 0 0 1 0\n")
+        for frame in range(8):
+            noise = np.random.default_rng(frame).integers(0, 256, (32, 64), dtype=np.uint8)
+            cv2.imwrite(str(images / f"{frame:06d}.png"), noise)
+    (folder / "poses" / "06.txt").write_text("".join(f"1 0 0 0 0 1 0 0 0 0 1 {1.1 * frame}\n" for frame in range(8)))
+    return folder
+
+
+def run(*arguments):
+    return exit_code(command.main, ["model", *(str(argument) for argument in arguments)])
+
+
+def test_a_checkpoint_on_kitti(workdir, root, tmp_path, capsys):
+    output = tmp_path / "out"
+    assert run("--root", root, "--sequences", "06", "--checkpoint", workdir, "--output", output) == 0
+    assert "model (offline, mean)" in capsys.readouterr().out
+    results = json.loads((output / "results.json").read_text(encoding="utf-8"))
+    constant = results["results"]["paths"][1]
+    assert constant["name"] == "constant predictor"
+    # The training's mean step is 1 m ahead with 0.01 rad of yaw, the truth 1.1 m.
+    assert constant["rpe_translation_m"]["mean"]["value"] == pytest.approx(0.1, abs=1e-6)
+    assert constant["rpe_rotation_deg"]["mean"]["value"] == pytest.approx(np.rad2deg(0.01), rel=1e-4)
+    assert any("mean step of the training split" in note for note in results["tables"][0]["notes"])
+    pictures = ("trajectory-06", "uncertainty-06", "sigma_error", "reliability", "sparsification", "pit")
+    assert {path.name for path in output.iterdir()} == {"table.md", "results.json", *(f"{p}.png" for p in pictures)}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["--sequences", "06"], "--root is missing: give the folder of KITTI"),
+        (["--dataset", "nuscenes", "--sequences", "scene-0001"], "--root is missing: give the folder of nuScenes"),
+        (["--dataset", "nuscenes", "--sequences", "scene-0001", "--root", "{root}", "--nuscenes-version", "v1"], "v1"),
+        (["--dataset", "synthetic", "--sequences", "first"], "--sequences first: expected seeds"),
+        (["--root", "{root}", "--sequences", "11"], "no poses at"),
+        (["--root", "{root}", "--sequences", "99"], "no sequence 99"),
+        (["--root", "{root}", "--sequences", "06", "--block", "0"], "--block is 0"),
+        (["--root", "{root}", "--sequences", "06", "--checkpoint", "absent"], "absent"),
+    ],
+)
+def test_mistakes(workdir, root, tmp_path, capsys, arguments, message):
+    given = [argument.format(root=root) for argument in arguments]
+    assert run("--checkpoint", workdir, "--output", tmp_path / "out", *given) == 2
+    complaint = capsys.readouterr().err
+    assert message in complaint and complaint.count("\n") == 1
