@@ -66,14 +66,22 @@ class ModelConfig:
 class DataConfig:
     """Which frames, cut into which windows, with which augmentation."""
 
-    # "kitti": a folder in the layout of the odometry benchmark. "synthetic": rendered while training.
-    dataset: Literal["kitti", "synthetic"] = "kitti"
+    # "kitti": a folder in the layout of the odometry benchmark. "nuscenes": the front camera of nuScenes v1.0.
+    # "synthetic": rendered while training.
+    dataset: Literal["kitti", "nuscenes", "synthetic"] = "kitti"
     root: str = ""
     # Paper: left colour camera.
     camera_folder: str = "image_2"
-    # Paper's training split.
+    # Version of nuScenes: the folder of its tables in `root`, such as v1.0-mini.
+    version: str = "v1.0-trainval"
+    # nuScenes: two frames a second instead of about twelve.
+    key_frames_only: bool = False
+    # nuScenes: interpolate the ego poses of all sensors at the images' times; for tables that lack the images' own.
+    interpolate: bool = False
+    # Paper's training split of KITTI. Empty with nuScenes: the split of data/nuscenes.py, for the paper gives none.
     train_sequences: tuple[str, ...] = ("00", "01", "02", "04", "08", "09")
-    # Sequences of the validation split. The paper names none; empty: the tail of every training sequence.
+    # Sequences of the validation split. The paper names none; empty: the tail of every training sequence, and with
+    # nuScenes the split of data/nuscenes.py.
     validation_sequences: tuple[str, ...] = ()
     validation_tail: float = 0.1
     # Folder made by bin/prepare_kitti; empty: decode while training.

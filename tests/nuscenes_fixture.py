@@ -3,10 +3,9 @@
     truth = write_nuscenes(tmp_path, frames=24)
     read_nuscenes(tmp_path, "scene-0061", version=VERSION).poses  # those of truth["scene-0061"], re-based
 
-It has what the real one has and readers trip over: rows in no order, rows of other sensors (without their files), camera
-frames 0.05 and 0.1 s apart, dropped frames, two vehicles with their own calibration, key frames in samples/ and the others
-in sweeps/, world coordinates of a kilometre. And, by `SCENES`, what real disks have: an image that is not there, a scene of
-one frame.
+It has what the real one has and readers trip over: rows in no order, rows of other sensors (without their files),
+frames 0.05 and 0.1 s apart, dropped frames, two vehicles with their own calibration, key frames in samples/ and the
+others in sweeps/, coordinates in the kilometres. And, by `SCENES`, an image that is not there and a scene of one frame.
 """
 
 import dataclasses
@@ -196,7 +195,8 @@ def _write_scene(
     size: tuple[int, int],
     rendered: bool,
 ) -> Truth:
-    start_us = START_US + number * 60_000_000
+    # The two vehicles drive at the same time, in different places.
+    start_us = START_US + number // 2 * 60_000_000
     # Revolutions 0, 1, 3, 5, 6, 8, 10: 12 of 20 a second; every sixth frame is a key frame, half a second apart.
     fired = np.arange(frames) * 5 // 3
     times_us = start_us + OFFSET_US["CAM_FRONT"] + fired * REVOLUTION_US

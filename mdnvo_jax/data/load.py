@@ -1,10 +1,12 @@
 """From a configuration to sequences: the one place that knows every data set."""
 
+import sys
+from collections import defaultdict
 from collections.abc import Sequence as Many
 from pathlib import Path
 
 from mdnvo_jax.config import Config, ImageConfig
-from mdnvo_jax.data import cache, kitti, windows
+from mdnvo_jax.data import cache, kitti, nuscenes, windows
 from mdnvo_jax.data.sequence import Sequence
 from mdnvo_jax.errors import InputError
 
@@ -17,9 +19,10 @@ def load_split(config: Config) -> tuple[list[Sequence], list[Sequence], ImageCon
     """Return (training sequences, validation sequences, image configuration with its virtual camera resolved).
 
     Data set "kitti": the sequences named, from `data.cache` where given, else decoded from `data.root`. Validation is
-    `data.validation_sequences`, or else the tail of every training sequence. Data set "synthetic": worlds of the seeds
-    0, 1, ... for training and `VALIDATION_SEED`, ... for validation, rendered when read (`TEST_SEED`, ... are kept for
-    tests of the result).
+    `data.validation_sequences`, or else the tail of every training sequence. Data set "nuscenes": the scenes named, and
+    for an empty list the split of `nuscenes`, of which scenes that cannot be used (too short, images not on disk) are
+    left out with a line on stderr. Data set "synthetic": worlds of the seeds 0, 1, ... for training and
+    `VALIDATION_SEED`, ... for validation, rendered when read (`TEST_SEED`, ... are kept for tests of the result).
 
     Raises:
       InputError: a sequence is missing or malformed, or training and validation share one.
@@ -32,16 +35,18 @@ def load_split(config: Config) -> tuple[list[Sequence], list[Sequence], ImageCon
             )
         train = synthetic_sequences(range(data.worlds), config)
         validation = synthetic_sequences(range(VALIDATION_SEED, VALIDATION_SEED + data.validation_worlds), config)
+    elif data.dataset == "nuscenes":
+        train, validation = (
+            nuscenes_sequences(names, config) if names else _nuscenes_part(part, config)
+            for names, part in ((data.train_sequences, "train"), (data.validation_sequences, "validation"))
+        )
+        _check_disjoint([sequence.name for sequence in train], [sequence.name for sequence in validation])
     else:
         if not data.train_sequences:
             raise InputError("data.train_sequences is empty: name sequences of the data set, such as 00 01 02")
         train = kitti_sequences(data.train_sequences, config)
         if data.validation_sequences:
-            shared = set(data.train_sequences) & set(data.validation_sequences)
-            if shared:
-                raise InputError(
-                    f"sequences {', '.join(sorted(shared))} are for training and validation: take them out of one list"
-                )
+            _check_disjoint(data.train_sequences, data.validation_sequences)
             validation = kitti_sequences(data.validation_sequences, config)
         else:
             train, validation = windows.split(train, data)
@@ -57,8 +62,7 @@ def kitti_sequences(names: Many[str], config: Config, *, require_poses: bool = T
       InputError: neither root nor cache is given, or a sequence is missing or malformed.
     """
     data = config.data
-    if len(set(names)) < len(names):
-        raise InputError(f"sequences {' '.join(names)}: expected each name once")
+    _check_unique(names)
     if data.cache:
         return cache.read_cache(data.cache, config.image, names)
     if not data.root:
@@ -78,6 +82,76 @@ def kitti_sequences(names: Many[str], config: Config, *, require_poses: bool = T
             )
         sequences.append(sequence)
     return sequences
+
+
+def nuscenes_sequences(names: Many[str], config: Config) -> list[Sequence]:
+    """Return the scenes of nuScenes of these names, from the cache where the configuration names one.
+
+    Raises:
+      InputError: neither root nor cache is given, or a scene is missing or malformed.
+    """
+    data = config.data
+    _check_unique(names)
+    if data.cache:
+        return cache.read_cache(data.cache, config.image, names)
+    if not data.root:
+        raise InputError("data.root is empty: set it to the folder of nuScenes, which holds samples/ and sweeps/")
+    return [
+        nuscenes.read_nuscenes(
+            data.root,
+            name,
+            version=data.version,
+            channels=config.image.channels,
+            key_frames_only=data.key_frames_only,
+            interpolate=data.interpolate,
+        )
+        for name in names
+    ]
+
+
+def _nuscenes_part(part: str, config: Config) -> list[Sequence]:
+    """Return the scenes of one part of the split of nuScenes that can be used; what is left out is said on stderr."""
+    data = config.data
+    unusable: dict[str, list[str]] = defaultdict(list)
+    if data.cache:
+        found = [s for s in cache.read_cache(data.cache, config.image) if nuscenes.split_of(s.name) == part]
+    else:
+        names: list[str] = []
+        for scene in nuscenes.scenes(data.root, data.version) if data.root else ():
+            if scene.split == part:
+                is_empty = not (scene.key_frames if data.key_frames_only else scene.frames)
+                (unusable["without a frame"] if is_empty else names).append(scene.name)
+        found = nuscenes_sequences(names, config)
+    if part == "train":
+        least = 1 + (data.shortest_window or data.window) * min(data.strides, default=1)
+    else:
+        least = 1 + next(iter(data.strides), 1)
+    usable = []
+    for sequence in found:
+        if sequence.count < least:
+            unusable[f"of fewer than {least} frames"].append(sequence.name)
+        elif nuscenes.missing_images(sequence):
+            unusable["with images that are not on disk"].append(sequence.name)
+        else:
+            usable.append(sequence)
+    for reason, scenes in unusable.items():
+        more = ", ..." if len(scenes) > 5 else ""
+        _say(f"nuScenes, {part}: scenes left out, {reason}: {len(scenes)} ({', '.join(scenes[:5])}{more})")
+    if not usable:
+        raise InputError(
+            f"{data.cache or data.root} has no scene of nuScenes for {part} that can be used: name some in "
+            f"data.{part}_sequences, or give another data.version"
+        )
+    longest_s = nuscenes.KEY_FRAME_GAP_S if data.key_frames_only else nuscenes.SWEEP_GAP_S
+    gaps = [nuscenes.find_gaps(s.timestamps, longest_s) for s in usable if s.timestamps is not None]
+    gaps = [found for found in gaps if found]
+    if gaps:
+        longest = max(gap.seconds for found in gaps for gap in found)
+        _say(
+            f"nuScenes, {part}: frames were dropped in {len(gaps)} of {len(usable)} scenes (gaps: "
+            f"{sum(map(len, gaps))}, up to {longest:.2f} s); steps across gaps are longer, and their labels right"
+        )
+    return usable
 
 
 def synthetic_sequences(seeds: Many[int], config: Config) -> list[Sequence]:
@@ -103,3 +177,20 @@ def synthetic_sequences(seeds: Many[int], config: Config) -> list[Sequence]:
         )
         for seed in seeds
     ]
+
+
+def _check_unique(names: Many[str]) -> None:
+    if len(set(names)) < len(names):
+        raise InputError(f"sequences {' '.join(names)}: expected each name once")
+
+
+def _check_disjoint(train: Many[str], validation: Many[str]) -> None:
+    shared = set(train) & set(validation)
+    if shared:
+        raise InputError(
+            f"sequences {', '.join(sorted(shared))} are for training and validation: take them out of one list"
+        )
+
+
+def _say(message: str) -> None:
+    print(message, file=sys.stderr)

@@ -125,11 +125,10 @@ def _claim(workdir: Path, resume: bool) -> None:
 
 def _check_same(config: Config, workdir: Path) -> None:
     """Refuse to resume with another configuration than the training began with; only `epochs` may change."""
-    before = json.loads((workdir / "config.json").read_text())
-    now = json.loads(configuration.as_json(config))
-    before["training"].pop("epochs")
-    now["training"].pop("epochs")
-    different = [f"{s}.{f}" for s, fields in now.items() for f, value in fields.items() if before[s].get(f) != value]
+    before = dataclasses.asdict(configuration.from_json((workdir / "config.json").read_text()))
+    now = dataclasses.asdict(config)
+    before["training"]["epochs"] = now["training"]["epochs"]
+    different = [f"{s}.{f}" for s, fields in now.items() for f, value in fields.items() if before[s][f] != value]
     if different:
         raise InputError(
             f"{', '.join(different)} differ from {workdir / 'config.json'}: "
