@@ -55,7 +55,7 @@ def log_so3(R: Array) -> Array:
     # angle / 2 = atan2(sine, w). Its ratio to the sine is a series in (sine / w)^2 where that is small.
     is_small = squared < 0.01 * w * w
     safe_w = xp.where(is_small, w, 1)
-    ratio = xp.where(is_small, squared, 0) / (safe_w * safe_w)
+    ratio = squared / (safe_w * safe_w)
     series = sum((-ratio) ** k / (2 * k + 1) for k in range(8)) / safe_w
     sine = xp.sqrt(xp.where(is_small, 1, squared))
     return 2 * vector * xp.where(is_small, series, xp.arctan2(sine, w) / sine)
