@@ -1,0 +1,185 @@
+"""A procedural driving world: frames, exact poses, depth and optical flow, all decided by a seed.
+
+A seed stands for a world and a drive through it. The layout is drawn on the host (`data/world/`); frames are rendered
+by a ray caster in JAX when they are read, with one compilation for each size. The same seed gives the same bits on the
+same machine however the frames are read, and the first frames of a longer drive are those of a shorter one.
+"""
+
+import collections
+import functools
+import math
+import threading
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from mdnvo_jax import geometry
+from mdnvo_jax.data.sequence import Camera, Sequence
+from mdnvo_jax.data.world import film, render, world
+from mdnvo_jax.data.world.motion import FRAME_S
+from mdnvo_jax.errors import InputError
+
+# Intrinsics and size of KITTI's left grey camera, sequence 00.
+_KITTI_CAMERA = (718.856, 718.856, 607.1928, 185.2157)
+_KITTI_SIZE = (376, 1241)
+# Frames of a drive that are kept: neighbouring windows share them.
+_KEPT_FRAMES = 16
+# Worlds that are kept whole; a world of 120 frames takes about a megabyte.
+_KEPT_WORLDS = 16
+
+
+class Truth(NamedTuple):
+    """What is known exactly about a frame.
+
+    Attributes:
+      depth: z of what the centre of each pixel sees, `[H, W]` float32, m; infinite in the sky.
+      flow: where that goes in the next frame, (u, v) in pixels, `[H, W, 2]` float32; NaN where it passes the camera.
+      moving: whether it belongs to something that moves by itself, `[H, W]` bool.
+    """
+
+    depth: np.ndarray
+    flow: np.ndarray
+    moving: np.ndarray
+
+
+def kitti_camera(height: int, width: int) -> Camera:
+    """Return KITTI's intrinsics scaled to a frame of `height` x `width`: 81 degrees across at KITTI's shape.
+
+    Both focal lengths follow the width, so that pixels stay square; pixel centres are at whole numbers.
+    """
+    scale = width / _KITTI_SIZE[1]
+    cy = (_KITTI_CAMERA[3] + 0.5) * height / _KITTI_SIZE[0] - 0.5
+    return _KITTI_CAMERA[0] * scale, _KITTI_CAMERA[1] * scale, (_KITTI_CAMERA[2] + 0.5) * scale - 0.5, cy
+
+
+def drive(
+    seed: int,
+    frames: int,
+    *,
+    height: int,
+    width: int,
+    channels: int = 1,
+    camera: Camera | None = None,
+    samples: int = 2,
+    effects: float = 1.0,
+) -> Sequence:
+    """Return a drive through the world of `seed`, its frames rendered when they are read.
+
+    Args:
+      seed: of the world, 0 or more.
+      frames: how many; 10 a second, as KITTI.
+      height: of a frame, rows.
+      width: of a frame, columns.
+      channels: 1 for grey, 3 for RGB.
+      camera: fx, fy, cx, cy in pixels; KITTI's, scaled to the frame, where None.
+      samples: rays a pixel, 1, 2 or 4: more is smoother and slower.
+      effects: strength of blur, noise, vignetting and drifting exposure; 0 leaves them out.
+
+    Returns:
+      A sequence with poses (the first is the identity), timestamps and camera; `read` may be called by many threads.
+
+    Raises:
+      InputError: an argument is out of range.
+    """
+    camera = _checked(seed, frames, height, width, camera)
+    if channels not in (1, 3):
+        raise InputError(f"channels {channels} of a synthetic drive: expected 1 for grey or 3 for RGB")
+    if samples not in (1, 2, 4):
+        raise InputError(f"samples {samples} a pixel of a synthetic drive: expected 1, 2 or 4")
+    if not 0 <= effects <= 10:
+        raise InputError(f"effects {effects} of a synthetic drive: expected 0 to 10, where 1 is ordinary")
+    style, _, poses = world.path(seed, frames)
+    rows = film.films(style, effects, FRAME_S * np.arange(frames))
+    look = functools.cache(lambda: jax.device_put(world.look_of(style, channels)))
+    kept: collections.OrderedDict[int, np.ndarray] = collections.OrderedDict()
+    lock = threading.Lock()
+
+    def read(index: int) -> np.ndarray:
+        if not 0 <= index < frames:
+            raise IndexError(f"frame {index} of a drive of {frames} frames")
+        with lock:
+            if index in kept:
+                kept.move_to_end(index)
+                return kept[index]
+        # Outside the lock: two threads that want the same frame at once render the same bits twice.
+        shown = render.render(
+            world.frame_at(_world(seed, frames), index, channels),
+            look(),
+            film.Film(*map(world.single, rows[index])),
+            world.single(camera),
+            index,
+            height=height,
+            width=width,
+            samples=samples,
+        )
+        frame = np.asarray(shown)
+        with lock:
+            kept[index] = frame
+            while len(kept) > _KEPT_FRAMES:
+                kept.popitem(last=False)
+        return frame
+
+    return Sequence(
+        name=f"world_{seed:06d}",
+        count=frames,
+        read=read,
+        timestamps=FRAME_S * np.arange(frames),
+        poses=geometry.inverse(poses[0]) @ poses,
+        camera=camera,
+    )
+
+
+def truth(seed: int, frames: int, index: int, *, height: int, width: int, camera: Camera | None = None) -> Truth:
+    """Return exact depth and flow of frame `index` of `drive(seed, frames, ...)`; see there for the arguments.
+
+    The point that a pixel's centre u sees, moved along with its thing, is seen at u + flow one frame later, whether or
+    not something hides it there. The flow of the last frame is that to the frame which a longer drive would have.
+
+    Raises:
+      InputError: an argument is out of range.
+    """
+    camera = _checked(seed, frames, height, width, camera)
+    if not 0 <= index < frames:
+        raise InputError(f"frame {index} of a drive of {frames} frames: expected 0 to {frames - 1}")
+    # One frame more than the drive has, for the motion of the last one.
+    whole = _world(seed, frames + 1)
+    depth, flow, moving = render.geometry(
+        world.frame_at(whole, index, 1),
+        world.moved_at(whole, index),
+        world.single(geometry.inverse(whole.poses[index + 1]) @ whole.poses[index]),
+        world.single(camera),
+        height=height,
+        width=width,
+    )
+    return Truth(np.asarray(depth), np.asarray(flow), np.asarray(moving))
+
+
+def depth(seed: int, frames: int, index: int, *, height: int, width: int, camera: Camera | None = None) -> np.ndarray:
+    """Return `Truth.depth` of a frame, `[H, W]`, m; see `truth`."""
+    return truth(seed, frames, index, height=height, width=width, camera=camera).depth
+
+
+def optical_flow(
+    seed: int, frames: int, index: int, *, height: int, width: int, camera: Camera | None = None
+) -> np.ndarray:
+    """Return `Truth.flow` from frame `index` to the next, `[H, W, 2]`, px; see `truth`."""
+    return truth(seed, frames, index, height=height, width=width, camera=camera).flow
+
+
+_world = functools.lru_cache(maxsize=_KEPT_WORLDS)(world.build_world)
+
+
+def _checked(seed: int, frames: int, height: int, width: int, camera: Camera | None) -> Camera:
+    """Return the camera of a drive, after a look at what else it is made of."""
+    if seed < 0:
+        raise InputError(f"seed {seed} of a synthetic drive: expected 0 or more")
+    if frames < 1:
+        raise InputError(f"{frames} frames of a synthetic drive: expected 1 or more")
+    if min(height, width) < 8:
+        raise InputError(f"synthetic frames of {width}x{height}: expected 8 or more rows and columns")
+    if camera is None:
+        return kitti_camera(height, width)
+    if len(camera) != 4 or not all(math.isfinite(value) for value in camera) or min(camera[:2]) <= 0:
+        raise InputError(f"camera {camera} of a synthetic drive: expected fx, fy, cx, cy with fx and fy above 0")
+    return camera

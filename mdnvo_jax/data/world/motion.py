@@ -1,0 +1,134 @@
+"""How the camera moves: a car that follows the road at a speed, sways on its springs, and carries the camera."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from mdnvo_jax.data.world.road import BEHIND_M, NODE_M, Road, ground, place
+from mdnvo_jax.data.world.style import Style, stream
+
+# KITTI's frame rate.
+FRAME_S = 0.1
+# Springs: sines of random phase at these frequencies, Hz, make a narrow band about the body's resonance. KITTI's pitch
+# swings at about 1.3 Hz, its roll is slower.
+_PITCH_HZ = (0.7, 2.0)
+_ROLL_HZ = (0.2, 1.5)
+_HEAVE_HZ = (0.9, 1.8)
+_SINES = 7
+
+
+class Mount(NamedTuple):
+    """Where the camera sits: ahead of the rear axle and above the road, m; attitude to the car, rad."""
+
+    ahead_m: float
+    height_m: float
+    pitch_rad: float
+    yaw_rad: float
+    roll_rad: float
+
+
+def draw_mount(seed: int) -> Mount:
+    """Return the camera mount of a world: KITTI's height of 1.65 m and slightly lowered view, varied."""
+    rng = stream(seed, "mount")
+    return Mount(
+        ahead_m=rng.uniform(0.3, 1.6),
+        height_m=1.65 + np.clip(rng.normal(0, 0.06), -0.15, 0.15),
+        pitch_rad=np.deg2rad(np.clip(rng.normal(-0.6, 1.2), -3.6, 2.4)),
+        yaw_rad=np.deg2rad(rng.normal(0, 0.6)),
+        roll_rad=np.deg2rad(rng.normal(0, 0.5)),
+    )
+
+
+def road_coordinate(road: Road, time: np.ndarray) -> np.ndarray:
+    """Return s of the car, m, at `time`, s: the integral of the road's speed with s = 0 at time 0.
+
+    Between two nodes the acceleration is constant, `a = (v1^2 - v0^2) / 2 l`, and takes `2 l / (v0 + v1)`; that holds
+    from and to a standstill too.
+    """
+    v0, v1 = road.speed[:-1], road.speed[1:]
+    if not road.speed.any():
+        return np.zeros_like(time)
+    arrival = np.concatenate([[0.0], np.cumsum(2 * NODE_M / (v0 + v1) + road.pause[:-1])])
+    departure = arrival + road.pause
+    # s and the clock start at the node where the road's table has s = 0.
+    start = round(BEHIND_M / NODE_M)
+    clock = time + departure[start]
+    node = np.clip(np.searchsorted(departure, clock, side="right") - 1, 0, len(v0) - 1)
+    elapsed = clock - departure[node]
+    acceleration = (v1[node] ** 2 - v0[node] ** 2) / (2 * NODE_M)
+    # While the car stands at the next node the parabola would run on.
+    elapsed = np.clip(elapsed, 0, arrival[node + 1] - departure[node])
+    travelled = v0[node] * elapsed + acceleration * elapsed**2 / 2
+    return -BEHIND_M + NODE_M * node + np.minimum(travelled, NODE_M)
+
+
+def camera_poses(style: Style, road: Road, frames: int) -> np.ndarray:
+    """Return `T_world_camera` of every frame, `[frames, 4, 4]`, in the world's axes, float64."""
+    # Frames on either side, so that the smoothed acceleration does not depend on where the drive is cut.
+    margin = 8
+    time = FRAME_S * np.arange(-margin, frames + margin)
+    s = road_coordinate(road, time)
+    speed = np.gradient(s, FRAME_S)
+    kernel = np.hanning(11)[1:-1]
+    braking = -np.convolve(np.gradient(speed, FRAME_S), kernel / kernel.sum(), mode="same")[margin:-margin]
+    time, s, speed = time[margin:-margin], s[margin:-margin], speed[margin:-margin]
+
+    d, drift = _wander(style, s)
+    x, z, heading = place(road, s, d)
+    yaw = heading + np.arctan(drift)
+    bend = road.curvature[np.rint((s + BEHIND_M) / NODE_M).astype(int)]
+    rng = stream(style.seed, "springs")
+    lively = np.minimum(np.abs(speed) / 8, 1.3) + 0.02
+    softness = rng.uniform(0.5, 1.5)
+    bounce_pitch = lively * np.deg2rad(rng.uniform(0.04, 0.3)) * _sway(rng, time, _PITCH_HZ)
+    bounce_roll = lively * np.deg2rad(rng.uniform(0.05, 0.35)) * _sway(rng, time, _ROLL_HZ)
+    heave = lively * rng.uniform(0.002, 0.015) * _sway(rng, time, _HEAVE_HZ)
+    # A braking car noses down, a cornering one leans out: about 0.3 and 0.4 degrees for a m/s^2.
+    bounce_pitch = bounce_pitch - softness * np.deg2rad(0.3) * braking
+    bounce_roll = bounce_roll - softness * np.deg2rad(0.4) * bend * speed**2
+    if style.reversing:
+        # The car looks the other way and keeps to the place where it would be: it rolls back along the road.
+        yaw = yaw + np.pi
+    height, slope_x, slope_z = ground(road, x, z)
+    pitch = np.arctan(slope_x * np.sin(yaw) + slope_z * np.cos(yaw)) + bounce_pitch
+    roll = -np.arctan(slope_x * np.cos(yaw) - slope_z * np.sin(yaw)) + bounce_roll
+    body = turn(yaw, 1) @ turn(pitch, 0) @ turn(roll, 2)
+    mount = draw_mount(style.seed)
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, :3, :3] = body @ turn(mount.yaw_rad, 1) @ turn(mount.pitch_rad, 0) @ turn(mount.roll_rad, 2)
+    axle = np.stack([x, -height - heave, z], axis=1)
+    poses[:, :3, 3] = axle + body @ np.array([0.0, -mount.height_m, mount.ahead_m])
+    return poses
+
+
+def turn(angle: np.ndarray | float, axis: int) -> np.ndarray:
+    """Return the rotation about coordinate `axis` by `angle`, rad, `[..., 3, 3]`."""
+    angle = np.asarray(angle, np.float64)
+    first, second = (axis + 1) % 3, (axis + 2) % 3
+    result = np.zeros((*angle.shape, 3, 3))
+    result[..., axis, axis] = 1
+    result[..., first, first] = result[..., second, second] = np.cos(angle)
+    result[..., second, first] = np.sin(angle)
+    result[..., first, second] = -np.sin(angle)
+    return result
+
+
+def ego_lane_m(style: Style) -> float:
+    """Return d of the middle of the lane that the car drives in, m."""
+    lane = int(stream(style.seed, "lane").integers(style.lanes))
+    return style.side * style.lane_m * (lane + 0.5)
+
+
+def _wander(style: Style, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (d, its derivative by s): the middle of the lane and a slow wander about it."""
+    rng = stream(style.seed, "wander")
+    amplitude, wavelength, phase = rng.uniform(0.03, 0.15, 3), rng.uniform(70, 200, 3), rng.uniform(0, 2 * np.pi, 3)
+    angle = 2 * np.pi * s[:, None] / wavelength + phase
+    d = ego_lane_m(style) + rng.normal(0, 0.2) + (amplitude * np.sin(angle)).sum(1)
+    return d, (amplitude * 2 * np.pi / wavelength * np.cos(angle)).sum(1)
+
+
+def _sway(rng: np.random.Generator, time: np.ndarray, band_hz: tuple[float, float]) -> np.ndarray:
+    """Return a swaying of unit variance within a band of frequencies, at `time`."""
+    frequency, phase = rng.uniform(*band_hz, _SINES), rng.uniform(0, 2 * np.pi, _SINES)
+    return np.sqrt(2 / _SINES) * np.sin(2 * np.pi * frequency * time[:, None] + phase).sum(1)

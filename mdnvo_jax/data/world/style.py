@@ -1,0 +1,166 @@
+"""What kind of world a seed stands for: how fast, how built up, which road, which light, which materials."""
+
+import zlib
+from typing import NamedTuple
+
+import numpy as np
+
+
+class Style(NamedTuple):
+    """The choices that hold for a whole world. Colours are linear reflectances (R, G, B).
+
+    Attributes:
+      seed: of the world.
+      cruise_mps: speed on the open road; 0 stands still.
+      reversing: whether the car drives backwards.
+      acceleration_mps2: of speeding up and braking.
+      stops, slows: chances that a place on the road makes the car stop, or slow down.
+      bends: strength of ordinary bends, as a share of what the speed allows.
+      side_roads: chance of a side road every 90 m.
+      steepness: largest slope of the ground, m/m.
+      side: 1 for traffic on the right, -1 on the left.
+      lane_m, lanes, half_width_m: width of a lane, lanes a direction, half the width of the carriageway.
+      sidewalk_m: width of the sidewalk, 0 for none.
+      built, trees, hedges, bushes, parked, poles, traffic: densities, 0 to 1.
+      rails, overpasses: whether there are guard rails; chance of an overpass every 400 m.
+      colours: of asphalt, verge, sidewalk, backdrop, sky overhead, sky at the horizon, sunlight, `[7, 3]`.
+      sun: unit vector towards the sun, `[3]`.
+      sun_strength, sky_strength: direct and diffuse light on level ground; their sum is 1 on a clear noon.
+      clouds: cover, 0 to 1. haze_m: distance at which a 1/e of the contrast is left.
+      centre_line, lane_period_m, lane_duty, edge_line, paint, wear: road markings: 0 none, 1 dashed, 2 solid; length of
+        a dash and gap; share of the dash; whether edges are marked; reflectance; how worn.
+      roughness: contrast of the asphalt. cracks, patches: how many. zebra: chance of a crossing every 60 m.
+      backdrop_rad: how high the distant trees or houses stand.
+    """
+
+    seed: int
+    cruise_mps: float
+    reversing: bool
+    acceleration_mps2: float
+    stops: float
+    slows: float
+    bends: float
+    side_roads: float
+    steepness: float
+    side: int
+    lane_m: float
+    lanes: int
+    half_width_m: float
+    sidewalk_m: float
+    built: float
+    trees: float
+    hedges: float
+    bushes: float
+    parked: float
+    poles: float
+    traffic: float
+    rails: bool
+    overpasses: float
+    colours: np.ndarray
+    sun: np.ndarray
+    sun_strength: float
+    sky_strength: float
+    clouds: float
+    haze_m: float
+    centre_line: int
+    lane_period_m: float
+    lane_duty: float
+    edge_line: bool
+    paint: float
+    wear: float
+    roughness: float
+    cracks: float
+    patches: float
+    zebra: float
+    backdrop_rad: float
+
+
+def stream(seed: int, name: str) -> np.random.Generator:
+    """Return the generator of one aspect of a world.
+
+    Each aspect has its own, and draws rows of a table: a longer drive then has the same first rows, and a change to one
+    aspect leaves the others alone.
+    """
+    return np.random.default_rng([seed, zlib.crc32(name.encode())])
+
+
+def draw_style(seed: int) -> Style:
+    """Return the style of the world `seed`; the cruising speed is flat from 0 to 28 m/s over the seeds."""
+    rng = stream(seed, "style")
+    cruise = rng.uniform(0, 28)
+    # Slow worlds are towns, fast ones open roads, with a wide overlap.
+    town = float(np.clip((19 - cruise) / 10 + rng.normal(0, 0.35), 0, 1))
+    motorway = bool(cruise > 19 and rng.random() < 0.6)
+    lanes = int(rng.integers(2, 4)) if motorway else int(1 + (rng.random() < 0.12))
+    lane = rng.uniform(3.3, 3.8) if motorway else rng.uniform(2.6, 3.6)
+    shoulder = rng.uniform(0.8, 2.5) if motorway else rng.uniform(0.1, 0.6) + town * rng.choice([0.0, 2.0])
+    wooded = rng.random()
+    overcast = rng.random() < 0.3
+    elevation, azimuth = np.deg2rad(rng.uniform(15, 65)), rng.uniform(0, 2 * np.pi)
+    sun = np.array([np.cos(elevation) * np.sin(azimuth), -np.sin(elevation), np.cos(elevation) * np.cos(azimuth)])
+    sun_strength = rng.uniform(0, 0.15) if overcast else rng.uniform(0.55, 0.85)
+    return Style(
+        seed=seed,
+        cruise_mps=0.0 if cruise < 1 else cruise,
+        reversing=bool(cruise < 5 and rng.random() < 0.15),
+        acceleration_mps2=rng.uniform(1.2, 2.8),
+        stops=0.15 * town * rng.random(),
+        slows=0.8 * (1 - motorway) * rng.random(),
+        bends=rng.random(),
+        side_roads=0.6 * town + 0.1 * (not motorway),
+        steepness=abs(rng.normal(0, 0.03)) if town > 0.5 else abs(rng.normal(0, 0.045)),
+        side=1 if rng.random() < 0.75 else -1,
+        lane_m=lane,
+        lanes=lanes,
+        half_width_m=lane * lanes + shoulder,
+        sidewalk_m=rng.uniform(1.2, 3.0) if rng.random() < town else 0.0,
+        built=town * rng.uniform(0.3, 1.0),
+        trees=wooded * rng.uniform(0.4, 1.0),
+        hedges=rng.random() * (0.3 + 0.5 * town),
+        bushes=rng.random(),
+        parked=town * rng.uniform(0, 0.8),
+        poles=rng.uniform(0.1, 1.0),
+        traffic=rng.uniform(0, 0.7) if motorway else rng.uniform(0, 0.4),
+        rails=bool(motorway and rng.random() < 0.7) or bool(town < 0.3 and rng.random() < 0.2),
+        overpasses=0.35 if motorway else 0.05,
+        colours=_colours(rng, overcast),
+        sun=sun,
+        sun_strength=sun_strength,
+        sky_strength=1 - sun_strength - (0.1 if overcast else 0.0),
+        clouds=rng.uniform(0.6, 1.0) if overcast else rng.uniform(0, 0.6),
+        haze_m=float(np.exp(rng.uniform(np.log(300), np.log(3000)))),
+        centre_line=2 if motorway else int(rng.choice(3, p=[0.25, 0.55, 0.2])),
+        lane_period_m=rng.choice([6.0, 9.0, 12.0, 18.0]),
+        lane_duty=rng.uniform(0.3, 0.5),
+        edge_line=bool(motorway or rng.random() < 0.5 * (1.2 - town)),
+        paint=rng.uniform(0.4, 0.8),
+        wear=rng.uniform(0.1, 0.9),
+        roughness=rng.uniform(0.15, 0.4),
+        cracks=rng.random() * (0.4 + 0.6 * town),
+        patches=rng.random() * (0.4 + 0.6 * town),
+        zebra=0.25 * town * rng.random(),
+        backdrop_rad=rng.uniform(0.015, 0.12) * (0.4 + wooded),
+    )
+
+
+def _colours(rng: np.random.Generator, overcast: bool) -> np.ndarray:
+    """Return the table `Style.colours`."""
+    asphalt = rng.uniform(0.07, 0.24) * (1 + rng.normal(0, 0.04, 3))
+    verge = _pick(rng, [(0.08, 0.13, 0.04), (0.16, 0.19, 0.07), (0.27, 0.23, 0.14), (0.22, 0.21, 0.19)])
+    sidewalk = _pick(rng, [(0.32, 0.31, 0.29), (0.22, 0.21, 0.20), (0.34, 0.25, 0.20)])
+    backdrop = _pick(rng, [(0.03, 0.05, 0.02), (0.06, 0.09, 0.04), (0.12, 0.13, 0.14)])
+    if overcast:
+        zenith = rng.uniform(0.5, 1.0) * np.array([0.95, 0.98, 1.0])
+        horizon = zenith * rng.uniform(0.9, 1.3)
+        sunlight = np.ones(3)
+    else:
+        zenith = rng.uniform(0.25, 0.7) * np.array([0.5, 0.75, 1.15])
+        horizon = rng.uniform(0.6, 1.4) * np.array([0.92, 0.98, 1.05])
+        sunlight = np.array([1.05, 1.0, rng.uniform(0.75, 0.95)])
+    return np.stack([asphalt, verge, sidewalk, backdrop, zenith, horizon, sunlight])
+
+
+def _pick(rng: np.random.Generator, choices: list[tuple[float, float, float]]) -> np.ndarray:
+    """Return one of the colours, lighter or darker and a little off."""
+    colour = np.array(choices[int(rng.integers(len(choices)))])
+    return colour * rng.uniform(0.7, 1.3) * (1 + rng.normal(0, 0.05, 3))
