@@ -232,3 +232,12 @@ def _boolean(text: str) -> bool:
     if text.lower() not in ("true", "false"):
         raise argparse.ArgumentTypeError(f"found {text!r}, expected true or false")
     return text.lower() == "true"
+
+
+def intrinsics(text: str) -> tuple[float, float, float, float]:
+    """Return fx, fy, cx, cy of an option such as `--camera 718.9,718.9,607.2,185.2`."""
+    try:
+        fx, fy, cx, cy = (float(value) for value in text.split(","))
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected four numbers fx,fy,cx,cy") from None
+    return fx, fy, cx, cy

@@ -34,6 +34,7 @@ import numpy as np
 from mdnvo_jax import files
 from mdnvo_jax.baselines import orbslam_system
 from mdnvo_jax.baselines.orbslam_system import BEFORE_A_MAP, TRACKED, Answer, ProcessError, System
+from mdnvo_jax.config import intrinsics
 from mdnvo_jax.errors import InputError, Parser, exit_code
 
 if TYPE_CHECKING:
@@ -292,7 +293,7 @@ def main(arguments: Many[str]) -> None:
     add("--vocabulary", required=True, metavar="FILE", help="ORB words of DBoW2 as .txt, .txt.gz or .tar.gz")
     add("--output", required=True, metavar="DIR", help="the files are written here")
     add("--force", action="store_true", help="overwrite files in --output")
-    add("--camera", type=_camera, metavar="fx,fy,cx,cy", help="intrinsics of the frames in pixels [calib.txt]")
+    add("--camera", type=intrinsics, metavar="fx,fy,cx,cy", help="intrinsics of the frames in pixels [calib.txt]")
     add("--timestamps", metavar="FILE", help="a time in seconds a line, one for each frame")
     add("--stride", type=int, default=1, metavar="N", help="use every Nth frame")
     add("--rate", type=float, metavar="HZ", help="feed no more frames a second [that of the timestamps, or 10]")
@@ -391,16 +392,6 @@ def _sha256(path: str) -> str:
     with Path(path).open("rb") as file:
         return hashlib.file_digest(file, "sha256").hexdigest()
 
-
-def _camera(text: str) -> tuple[float, ...]:
-    """Return the four intrinsics in `text`."""
-    values = tuple(float(value) for value in text.split(","))
-    if len(values) != 4:
-        raise ValueError
-    return values
-
-
-_camera.__name__ = "fx,fy,cx,cy"  # argparse names the type in its complaint
 
 if __name__ == "__main__":
     raise SystemExit(exit_code(main))
