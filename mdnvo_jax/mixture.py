@@ -240,6 +240,18 @@ def affine(mixture: Mixture, scale: ArrayLike, shift: ArrayLike) -> Mixture:
     return Mixture(mixture.logits, mixture.mean * scale + shift, mixture.log_scale + jnp.log(scale))
 
 
+def widen(mixture: Mixture, factor: ArrayLike) -> Mixture:
+    """Distribution of `mean + factor * (y - mean)`: `mixture` about its own mean, `factor` `[K]` times as wide.
+
+    Means of components move with their widths, so that the mean and the shape stay and every standard deviation and
+    interval is multiplied. ValueError where a factor is not positive.
+    """
+    mixture, factor = _checked(mixture), _float(factor)
+    _check_positive(factor, "factor")
+    centre = mean(mixture)[..., None, :]
+    return Mixture(mixture.logits, centre + factor * (mixture.mean - centre), mixture.log_scale + jnp.log(factor))
+
+
 def crps(mixture: Mixture, value: ArrayLike) -> Array:
     """Continuous ranked probability score, by dimension: E|X - y| - E|X - X'| / 2, in the units of the dimension.
 

@@ -7,6 +7,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any
 
 from mdnvo_jax import files
+from mdnvo_jax.config import intrinsics
 from mdnvo_jax.errors import InputError, Parser, exit_code
 
 
@@ -19,12 +20,13 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--force", action="store_true", help="overwrite files in --output")
     parser.add_argument("--stride", type=int, default=1, metavar="N", help="use every Nth frame")
     parser.add_argument("--timestamps", metavar="FILE", help="a time in seconds a line, one for each frame")
-    parser.add_argument("--camera", type=_camera, metavar="fx,fy,cx,cy", help="intrinsics of the frames in pixels")
+    parser.add_argument("--camera", type=intrinsics, metavar="fx,fy,cx,cy", help="intrinsics of the frames in pixels")
     parser.add_argument("--mode", choices=("offline", "streaming"), default="offline", help="streaming: past alone")
     parser.add_argument("--bad-frames", choices=("stop", "hold"), default="stop", help="what an unreadable frame does")
     parser.add_argument(
         "--estimate", choices=("mean", "strongest"), default="mean", help="what a mixture is reported by"
     )
+    parser.add_argument("--no-recalibration", action="store_true", help="sigmas as the network gave them")
     options = parser.parse_args(arguments)
     if options.stride < 1:
         raise InputError(f"--stride is {options.stride}: expected 1 or more")
@@ -37,7 +39,7 @@ def main(arguments: Sequence[str]) -> None:
     def bar(chunks: Iterator[Any], total: int) -> Iterator[Any]:
         return logs.track(chunks, "predicting", total)
 
-    model = predictor.load(options.checkpoint)
+    model = predictor.load(options.checkpoint, recalibrated=not options.no_recalibration)
     frames = read_frames(
         options.images,
         model.config.image.channels,
@@ -55,16 +57,6 @@ def main(arguments: Sequence[str]) -> None:
         f"ms a frame {json.dumps(path.about['ms_per_frame'])}; the files are in {output}"
     )
 
-
-def _camera(text: str) -> tuple[float, ...]:
-    """Return the four intrinsics in `text`."""
-    values = tuple(float(value) for value in text.split(","))
-    if len(values) != 4:
-        raise ValueError
-    return values
-
-
-_camera.__name__ = "fx,fy,cx,cy"  # argparse names the type in its complaint
 
 if __name__ == "__main__":
     raise SystemExit(exit_code(main))

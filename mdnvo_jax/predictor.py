@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from mdnvo_jax import mixture
+from mdnvo_jax import mixture, recalibration
 from mdnvo_jax.config import Config
 from mdnvo_jax.data.folder import read_frames
 from mdnvo_jax.data.images import prepare
@@ -47,6 +47,7 @@ class Predictor(NamedTuple):
       stream_start: (model) -> the state of a stream.
       stream_step: (model, state, image, usable) -> (state, step); see `mdnvo_jax.streaming`.
       source: the folder of the checkpoint.
+      sigma_scale: factors by component that every sigma is multiplied by already, `[6]`; None where none were fitted.
     """
 
     config: Config
@@ -56,10 +57,15 @@ class Predictor(NamedTuple):
     stream_start: Callable[..., Any]
     stream_step: Callable[..., Any]
     source: str
+    sigma_scale: np.ndarray | None = None
 
 
-def load(path: str | os.PathLike[str]) -> Predictor:
+def load(path: str | os.PathLike[str], *, recalibrated: bool = True) -> Predictor:
     """Return the model in a checkpoint: the best step of a training's --workdir, or the folder of one step.
+
+    Args:
+      path: the folder.
+      recalibrated: multiply every sigma by what `evaluate recalibrate` left with the checkpoint, if it has.
 
     Raises:
       InputError: there is none, or it is damaged.
@@ -70,6 +76,8 @@ def load(path: str | os.PathLike[str]) -> Predictor:
     template = state_template(network, config).model
     here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
     model = checkpoint.read_model(folder, checkpoint.abstract(template, here))
+    found = recalibration.read(folder) if recalibrated else None
+    sigma_scale = None if found is None else jnp.asarray(found.scale, jnp.float32)
 
     def features(model: Model, first: jax.Array, second: jax.Array) -> jax.Array:
         variables = {"params": model.params, "batch_stats": model.batch_stats}
@@ -78,10 +86,19 @@ def load(path: str | os.PathLike[str]) -> Predictor:
     def densities(model: Model, features: jax.Array, mask: jax.Array) -> Mixture:
         variables = {"params": model.params, "batch_stats": model.batch_stats}
         outputs = network.apply(variables, features, mask, method="outputs_from_features")
-        return mixture_from_outputs(outputs, model.labels, config.model, model.residual_scale)
+        return mixture_from_outputs(outputs, model.labels, config.model, model.residual_scale, sigma_scale)
 
-    start, step = stream(network, config, config.data.window)
-    return Predictor(config, model, jax.jit(features), jax.jit(densities), start, jax.jit(step), str(folder))
+    start, step = stream(network, config, config.data.window, sigma_scale)
+    return Predictor(
+        config=config,
+        model=model,
+        features=jax.jit(features),
+        densities=jax.jit(densities),
+        stream_start=start,
+        stream_step=jax.jit(step),
+        source=str(folder),
+        sigma_scale=None if found is None else found.scale,
+    )
 
 
 def predict(
@@ -141,6 +158,7 @@ def predict(
         "source": sequence.name,
         "checkpoint": predictor.source,
         "mode": mode,
+        "sigma_scale": "none" if predictor.sigma_scale is None else predictor.sigma_scale.tolist(),
         "camera": "given" if sequence.camera else "unknown: the whole frame is taken to be the training camera's",
         "start_s": round(seconds.pop("start"), 3),
         "ms_per_frame": {stage: round(1e3 * total / sequence.count, 3) for stage, total in seconds.items()},

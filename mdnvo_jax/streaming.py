@@ -72,7 +72,7 @@ def held_step(mean: jax.Array, variance: jax.Array, labels: Labels, components: 
 
 
 def stream(
-    network: Network, config: Config, window: int
+    network: Network, config: Config, window: int, sigma_scale: jax.Array | None = None
 ) -> tuple[
     Callable[[Model], StreamState], Callable[[Model, StreamState, jax.Array, jax.Array], tuple[StreamState, StreamStep]]
 ]:
@@ -85,6 +85,7 @@ def stream(
       network: from `build`.
       config: the experiment the model comes from.
       window: pairs remembered; the length the network was trained with is the natural choice.
+      sigma_scale: factors `[6]` that every sigma is multiplied by, if any.
     """
     shape = (config.image.height, config.image.width, config.image.channels)
 
@@ -111,7 +112,7 @@ def stream(
         mask = jnp.concatenate([state.mask[1:], pair_usable[None]])
         variables = {"params": model.params, "batch_stats": model.batch_stats}
         outputs = network.apply(variables, features[None], mask[None], method="outputs_from_features")[0, -1]
-        seen_step = mixture_from_outputs(outputs, model.labels, config.model, model.residual_scale)
+        seen_step = mixture_from_outputs(outputs, model.labels, config.model, model.residual_scale, sigma_scale)
         held = held_step(state.mean, state.variance, model.labels, seen_step.logits.shape[-1])
         density = jax.tree.map(lambda seen, other: jnp.where(pair_usable, seen, other), seen_step, held)
         mean = mixture.mean(density)

@@ -250,7 +250,7 @@ def area_under_sparsification_error(sigma: np.ndarray, error: np.ndarray) -> np.
 def fit_sigma_scale(mixture: Mixture, truth: np.ndarray) -> np.ndarray:
     """Factor by component by which widths should be multiplied, `[K]`, by maximum likelihood. For validation data only.
 
-    Minimises the mean NLL of each component's marginal after `apply_sigma_scale`. The likelihood, not a quantile, is
+    Minimises the mean NLL of each component's marginal after `mixture.widen`. The likelihood, not a quantile, is
     fitted: it needs no choice of level, and uses all of the density. Independent dimensions separate, so
     this is their joint optimum; for coupling "joint" it is that of the marginals. Factors lie within 1/64 and 64.
 
@@ -279,18 +279,6 @@ def fit_sigma_scale(mixture: Mixture, truth: np.ndarray) -> np.ndarray:
         bounds = grid[max(nearest - 1, 0)], grid[min(nearest + 1, len(grid) - 1)]
         factors.append(np.exp(optimize.minimize_scalar(_scaled_nll, bounds=bounds, args=terms, method="bounded").x))
     return np.array(factors)
-
-
-def apply_sigma_scale(mixture: Mixture, scale: np.ndarray) -> Mixture:
-    """Widen a density about its own mean by `scale`, `[K]`: distribution of mean + scale * (y - mean).
-
-    Component means move with the widths, so the mean and the shape stay and every standard deviation, interval and
-    distance from the mean is multiplied.
-    """
-    centre = density.mean(mixture)[..., None, :]
-    return mixture._replace(
-        mean=centre + scale * (mixture.mean - centre), log_scale=mixture.log_scale + np.log(np.asarray(scale))
-    )
 
 
 def _scaled_nll(

@@ -19,6 +19,13 @@ from mdnvo_jax.evaluation.plots import BLUE, COLOURS, GREEN, GREY, PANELS, SKY, 
 
 # Median of |e| / sigma of a Gaussian: where the medians lie if sigma is right.
 _MEDIAN_OF_SIGMA = 0.6745
+# What each picture shows.
+SHOWS = {
+    "sigma_error.png": "Sigma against absolute error",
+    "reliability.png": "Reliability",
+    "sparsification.png": "Sparsification",
+    "pit.png": "Probability integral transform",
+}
 _SIGMA_BINS = 8
 _LEVELS = np.linspace(0.02, 0.98, 49)
 

@@ -50,17 +50,18 @@ def from_options(options: argparse.Namespace) -> Report:
 
     if options.block < 1:
         raise InputError(f"--block is {options.block}: expected 1 frame or more")
-    model = predictor.load(options.checkpoint)
+    model = predictor.load(options.checkpoint, recalibrated=not options.no_recalibration)
     predicted = []
-    for sequence in _sequences(options, model.config):
+    for sequence in sequences(options, model.config):
         if sequence.poses is None or sequence.count < 2:
             raise InputError(f"sequence {sequence.name} has no poses of two frames: there is nothing to judge against")
-        bar = functools.partial(_track, name=sequence.name)
+        bar = functools.partial(track, name=sequence.name)
         path = predictor.predict(model, sequence, mode=options.mode, estimate=options.estimate, progress=bar)
         predicted.append(Predicted(sequence.name, path, sequence.poses))
     labels = model.model.labels
     step = MeanStep(np.asarray(labels.mean, float), np.asarray(labels.std, float), "mean step of the training split")
-    return evaluate(f"model ({options.mode}, {options.estimate})", predicted, step, block=options.block)
+    how = f"{options.mode}, {options.estimate}{'' if model.sigma_scale is None else ', sigma recalibrated'}"
+    return evaluate(f"model ({how})", predicted, step, block=options.block)
 
 
 def evaluate(name: str, predicted: Many[Predicted], constant_step: MeanStep, *, block: int) -> Report:
@@ -91,7 +92,7 @@ def evaluate(name: str, predicted: Many[Predicted], constant_step: MeanStep, *, 
         {"paths": summaries, "calibration": [tabled.calibration_data(row) for row in rows]},
         [
             PathPicture(
-                f"trajectory-{_safe(item.name)}.png",
+                f"trajectory-{safe(item.name)}.png",
                 f"Path from above, split {item.name}, no alignment but of the first pose",
                 {name: score.poses},
                 item.truth,
@@ -101,7 +102,7 @@ def evaluate(name: str, predicted: Many[Predicted], constant_step: MeanStep, *, 
         [CalibrationPictures("", f"{name}, split {sequences}, sigma of the whole mixture, no alignment", scores)],
         [
             UncertaintyPicture(
-                f"uncertainty-{_safe(item.name)}.png",
+                f"uncertainty-{safe(item.name)}.png",
                 f"Steps of {name}, split {item.name}, with 3-sigma bands (no alignment)",
                 item.trajectory,
                 true_steps(item.truth),
@@ -120,7 +121,7 @@ def _score(name: str, item: Predicted, constant_step: MeanStep) -> tuple[PathSco
     return scoring.score_path(name, item.name, paired, "none"), floor
 
 
-def _track(chunks: Iterator[Any], total: int, *, name: str) -> Iterator[Any]:
+def track(chunks: Iterator[Any], total: int, *, name: str) -> Iterator[Any]:
     """Show how far the prediction of a sequence is."""
     from mdnvo_jax.training import logs
 
@@ -152,7 +153,7 @@ def _calibrations(
     return [*rows, *floor], scores[0]
 
 
-def _sequences(options: argparse.Namespace, config: "Config") -> list["Sequence"]:
+def sequences(options: argparse.Namespace, config: "Config") -> list["Sequence"]:
     """Return the sequences to judge on."""
     from mdnvo_jax.data import load
 
@@ -175,6 +176,6 @@ def _sequences(options: argparse.Namespace, config: "Config") -> list["Sequence"
     return read(options.sequences, dataclasses.replace(config, data=data))
 
 
-def _safe(name: str) -> str:
+def safe(name: str) -> str:
     """Return a sequence's name as part of a file name."""
     return name.replace("/", "_")

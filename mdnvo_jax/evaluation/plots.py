@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mdnvo_jax import files
+from mdnvo_jax import files, geometry
 from mdnvo_jax.evaluation import optional
 
 if TYPE_CHECKING:
@@ -115,47 +115,88 @@ def plot_uncertainty(
     figure, grid = canvas(11.0, 7.2, rows=3, columns=2)
     steps = trajectory.steps
     sigma = np.sqrt(np.diagonal(trajectory.step_covariance, axis1=1, axis2=2))
-    frames = np.arange(1, len(steps) + 1)
     flagged = np.array([bool(flag) for flag in trajectory.flags], bool)
     legend: dict[str, Any] = {}
     for component, (name, unit, factor) in enumerate(PANELS):
         # Translation in the left column, rotation in the right one.
         axes = grid[component % 3, component // 3]
         middle, reach = factor * steps[:, component], _SIGMAS * factor * sigma[:, component]
-        # A drawing of one step needs markers: a line through one point is invisible.
-        stroke: dict[str, Any] = {"marker": "." if len(steps) <= 60 else None, "markersize": 4}
-        stroke["linewidth"] = 1.3 if len(steps) <= 300 else 0.7
-        # Half a frame on either side, so that a single step has a band as well.
-        band = axes.fill_between(
-            np.concatenate([[0.5], frames, [len(steps) + 0.5]]),
-            *(np.pad(middle + sign * reach, 1, mode="edge") for sign in (-1, 1)),
-            color=SKY, alpha=0.35, linewidth=0,
-        )  # fmt: skip
-        (line,) = axes.plot(frames, middle, color=BLUE, **stroke)
-        drawn = {"prediction": line, "3-sigma band": band}
-        if truth is not None:
-            true = factor * truth[:, component]
-            (drawn["ground truth"],) = axes.plot(frames, true, color="black", **stroke)
-            outside = np.abs(true - middle) > reach
-            if outside.any():
-                (drawn["ground truth outside"],) = axes.plot(
-                    frames[outside], true[outside], linestyle="", marker="x", color=VERMILION, markersize=5
-                )
-        if flagged.any():
-            (drawn["flagged"],) = axes.plot(
-                frames[flagged], middle[flagged], linestyle="", marker="^", color=VERMILION, markersize=6
-            )
-        _bound(axes, middle, reach)
+        true = None if truth is None else factor * truth[:, component]
+        legend.update(_draw_steps(axes, middle, reach, true, flagged))
         axes.set_ylabel(f"{name} ({unit})")
-        axes.grid(alpha=0.3)
-        axes.margins(x=0.01)
-        axes.xaxis.get_major_locator().set_params(integer=True)
-        legend.update(drawn)
         if component % 3 == 2:
             axes.set_xlabel("frame")
     figure.suptitle(title or f"Predicted steps with 3-sigma bands, {len(steps) + 1} frames (no alignment)")
     figure.legend(list(legend.values()), list(legend), loc="outside lower center", ncols=len(legend), fontsize=9)
     save(figure, path)
+
+
+def plot_scene(trajectory: "Trajectory", reference: np.ndarray, path: str | os.PathLike[str], *, title: str) -> None:
+    """Draw the paper's figure of uncertainty: the path, and x, y and yaw of every step with their 3-sigma bands.
+
+    Of a car's axes, x ahead and y to the left, as nuScenes has them: the camera's z and -x; yaw is about -y.
+
+    Args:
+      trajectory: of `odometry`.
+      reference: true poses, `[N, 4, 4]`; the prediction is put on the first of them.
+      path: the picture to write.
+      title: says scene and method.
+    """
+    figure, grid = canvas(11.0, 8.0, rows=2, columns=2)
+    into_first = np.linalg.inv(reference[0])
+    across, ahead = _from_above(into_first @ reference)
+    grid[0, 0].plot(across, ahead, color="black", linewidth=2.2)
+    grid[0, 0].plot(*_from_above(trajectory.poses), color=BLUE, linewidth=1.6)
+    _mark_start(grid[0, 0], across[0], ahead[0])
+    _finish_map(grid[0, 0], "Path from above, no alignment but of the first pose")
+    truth = np.asarray(geometry.matrix_to_step(geometry.relative_steps(reference)))
+    flagged = np.array([bool(flag) for flag in trajectory.flags], bool)
+    legend: dict[str, Any] = {}
+    panels = (("x, ahead", 2, 1.0, "m"), ("y, left", 0, -1.0, "m"), ("yaw, to the left", 4, -180 / np.pi, "deg"))
+    for axes, (name, component, factor, unit) in zip((grid[0, 1], grid[1, 0], grid[1, 1]), panels, strict=True):
+        middle, true = (factor * steps[:, component] for steps in (trajectory.steps, truth))
+        reach = _SIGMAS * abs(factor) * trajectory.sigma[:, component]
+        legend.update(_draw_steps(axes, middle, reach, true, flagged))
+        axes.set_title(name, fontsize=11)
+        axes.set_ylabel(f"of a step ({unit})")
+        axes.set_xlabel("frame")
+    figure.suptitle(title)
+    figure.legend(list(legend.values()), list(legend), loc="outside lower center", ncols=len(legend), fontsize=9)
+    save(figure, path)
+
+
+def _draw_steps(
+    axes: Any, middle: np.ndarray, reach: np.ndarray, true: np.ndarray | None, flagged: np.ndarray
+) -> dict[str, Any]:
+    """Draw one component of every step, `[n]`, with its band and its truth, and return what the legend is to name."""
+    frames = np.arange(1, len(middle) + 1)
+    # A drawing of one step needs markers: a line through one point is invisible.
+    stroke: dict[str, Any] = {"marker": "." if len(middle) <= 60 else None, "markersize": 4}
+    stroke["linewidth"] = 1.3 if len(middle) <= 300 else 0.7
+    # Half a frame on either side, so that a single step has a band as well.
+    band = axes.fill_between(
+        np.concatenate([[0.5], frames, [len(middle) + 0.5]]),
+        *(np.pad(middle + sign * reach, 1, mode="edge") for sign in (-1, 1)),
+        color=SKY, alpha=0.35, linewidth=0,
+    )  # fmt: skip
+    (line,) = axes.plot(frames, middle, color=BLUE, **stroke)
+    drawn = {"prediction": line, "3-sigma band": band}
+    if true is not None:
+        (drawn["ground truth"],) = axes.plot(frames, true, color="black", **stroke)
+        outside = np.abs(true - middle) > reach
+        if outside.any():
+            (drawn["ground truth outside"],) = axes.plot(
+                frames[outside], true[outside], linestyle="", marker="x", color=VERMILION, markersize=5
+            )
+    if flagged.any():
+        (drawn["flagged"],) = axes.plot(
+            frames[flagged], middle[flagged], linestyle="", marker="^", color=VERMILION, markersize=6
+        )
+    _bound(axes, middle, reach)
+    axes.grid(alpha=0.3)
+    axes.margins(x=0.01)
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    return drawn
 
 
 def canvas(width: float, height: float, *, rows: int = 1, columns: int = 1) -> tuple[Any, Any]:

@@ -1,4 +1,4 @@
-"""What one evaluation found, and the files it leaves: table.md, results.json and pictures."""
+"""What one evaluation found, and the files it leaves: table.md, report.html, results.json and pictures."""
 
 import json
 import shlex
@@ -12,8 +12,9 @@ from typing import Any
 import numpy as np
 
 from mdnvo_jax import files
-from mdnvo_jax.evaluation import calibration_plots, plots, tables
+from mdnvo_jax.evaluation import calibration_plots, page, plots, tables
 from mdnvo_jax.evaluation.calibration import StepScores
+from mdnvo_jax.evaluation.page import Picture
 from mdnvo_jax.evaluation.tables import Table
 from mdnvo_jax.odometry import Trajectory
 
@@ -68,6 +69,23 @@ class UncertaintyPicture:
 
 
 @dataclass(frozen=True)
+class ScenePicture:
+    """The path of one sequence, and x, y and yaw of its steps with their bands.
+
+    Attributes:
+      file: its name.
+      title: says scene and method.
+      trajectory: predicted.
+      reference: true poses, `[N, 4, 4]`.
+    """
+
+    file: str
+    title: str
+    trajectory: Trajectory
+    reference: np.ndarray
+
+
+@dataclass(frozen=True)
 class Report:
     """What one evaluation found.
 
@@ -78,6 +96,7 @@ class Report:
       pictures: of trajectories, to draw.
       calibration: to draw.
       uncertainty: to draw.
+      scenes: to draw.
     """
 
     tables: Sequence[Table]
@@ -86,34 +105,50 @@ class Report:
     pictures: Sequence[PathPicture]
     calibration: Sequence[CalibrationPictures] = field(default_factory=tuple)
     uncertainty: Sequence[UncertaintyPicture] = field(default_factory=tuple)
+    scenes: Sequence[ScenePicture] = field(default_factory=tuple)
 
 
 def write(report: Report, directory: Path) -> list[str]:
     """Write everything into `directory`, an existing folder, and return the names of the files."""
     every = [*report.tables, *report.details]
     files.write_text(directory / "table.md", "\n".join(tables.as_markdown(table) for table in every))
-    written = ["table.md", "results.json"]
-    for picture in report.pictures:
-        plots.plot_paths(picture.paths, directory / picture.file, title=picture.title, reference=picture.reference)
-        written.append(picture.file)
-    for bands in report.uncertainty:
-        plots.plot_uncertainty(bands.trajectory, directory / bands.file, truth=bands.truth, title=bands.title)
-        written.append(bands.file)
-    for group in report.calibration:
-        folder = directory / group.folder
-        folder.mkdir(exist_ok=True)
-        names = calibration_plots.plot_calibration(group.scores, folder, title=group.title)
-        written += [str(Path(group.folder) / name) for name in names]
+    pictures = _draw(report, directory)
+    command = shlex.join(sys.orig_argv)
+    versions = {name: metadata.version(name) for name in ("mdnvo_jax", "evo", "numpy", "scipy", "matplotlib")}
+    about = {"Command": command, "Versions": ", ".join(f"{name} {version}" for name, version in versions.items())}
+    title = f"Evaluation: {directory.resolve().name}"
+    files.write_text(directory / "report.html", page.as_page(title, about, report.tables, report.details, pictures))
     data = {
-        "command": shlex.join(sys.orig_argv),
-        "versions": {name: metadata.version(name) for name in ("mdnvo_jax", "evo", "numpy", "scipy", "matplotlib")},
+        "command": command,
+        "versions": versions,
         "results": report.results,
         "tables": [tables.as_data(table) for table in every],
     }
     # Last, so that a complete results.json says that everything else is there as well.
     text = json.dumps(tables.finite(data), indent=2, allow_nan=False) + "\n"
     files.write_text(directory / "results.json", text)
-    return written
+    names = [str(picture.path.relative_to(directory)) for picture in pictures]
+    return ["table.md", "report.html", "results.json", *names]
+
+
+def _draw(report: Report, directory: Path) -> list[Picture]:
+    """Draw every picture into `directory`."""
+    drawn = []
+    for picture in report.pictures:
+        plots.plot_paths(picture.paths, directory / picture.file, title=picture.title, reference=picture.reference)
+        drawn.append(Picture(directory / picture.file, picture.title))
+    for bands in report.uncertainty:
+        plots.plot_uncertainty(bands.trajectory, directory / bands.file, truth=bands.truth, title=bands.title)
+        drawn.append(Picture(directory / bands.file, bands.title))
+    for scene in report.scenes:
+        plots.plot_scene(scene.trajectory, scene.reference, directory / scene.file, title=scene.title)
+        drawn.append(Picture(directory / scene.file, scene.title))
+    for group in report.calibration:
+        folder = directory / group.folder
+        folder.mkdir(exist_ok=True)
+        names = calibration_plots.plot_calibration(group.scores, folder, title=group.title)
+        drawn += [Picture(folder / name, f"{calibration_plots.SHOWS[name]}: {group.title}") for name in names]
+    return drawn
 
 
 def as_text(report: Report) -> str:

@@ -1,10 +1,12 @@
 """Tables that say what they show: rows name split, alignment, delta and frames, headers name the statistic."""
 
 import dataclasses
+import itertools
 import math
 import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from html import escape
 from typing import Any, Literal
 
 _UNLIMITED = 100_000
@@ -29,12 +31,20 @@ class Column:
       header: what is printed above it, with the unit.
       digits: digits after the point.
       best: which value is printed bold: the lowest, the highest, the one nearest to a number, or none.
+      over: what stands over it and its neighbours, such as a method. The best value is then sought in the row, among
+        the columns of the same header, and not in the column.
     """
 
     key: str
     header: str
     digits: int = 3
     best: Literal["low", "high"] | float | None = None
+    over: str = ""
+
+    @property
+    def full_header(self) -> str:
+        """The header with what stands over it."""
+        return f"{self.over} {self.header}".strip()
 
 
 Cell = Value | str
@@ -69,7 +79,7 @@ def as_markdown(table: Table) -> str:
     lines = [
         f"### {table.title}",
         "",
-        "| " + " | ".join(_escaped(column.header) for column in table.columns) + " |",
+        "| " + " | ".join(_escaped(column.full_header) for column in table.columns) + " |",
         "|" + "|".join("---" if _is_text(table, column) else "---:" for column in table.columns) + "|",
     ]
     for number, row in enumerate(table.rows):
@@ -92,23 +102,66 @@ def as_text(table: Table, width: int | None = None) -> str:
     """
     width = shutil.get_terminal_size((_UNLIMITED, 24)).columns if width is None else width
     best = _best(table)
-    shared = {key: _shared(table, key) for key in table.context}
-    said = ", ".join(f"{column.header} {shared[column.key]}" for column in table.columns if shared.get(column.key))
+    said, columns = _said_once(table)
     printed = []
-    for column in table.columns:
-        if not shared.get(column.key):
-            cells = [
-                _text(row.get(column.key), column) + ("*" if (number, column.key) in best else "")
-                for number, row in enumerate(table.rows)
-            ]
-            size = max(map(len, [column.header, *cells]))
-            align = str.ljust if _is_text(table, column) else str.rjust
-            printed.append([align(cell, size) for cell in [column.header, *cells]])
+    for over, group in itertools.groupby(columns, lambda column: column.over or column.key):
+        inside = list(group)
+        parts = [_printed(table, column, best) for column in inside]
+        joined = ["  ".join(cells) for cells in zip(*parts, strict=True)]
+        size = max(len(over), len(joined[0])) if inside[0].over else len(joined[0])
+        above = [(over if inside[0].over else "").center(size)] if any(column.over for column in columns) else []
+        printed.append([*above, *(cells.rjust(size) if inside[0].over else cells for cells in joined)])
     lines = [table.title, *([f"every row: {said}"] if said else [])]
     for block in _fitting(printed, width):
         lines += ["", *("  ".join(cells).rstrip() for cells in zip(*block, strict=True))]
     lines += [""] * bool(table.notes) + [f"- {note}" for note in table.notes]
     return "\n".join(lines) + "\n"
+
+
+def as_html(table: Table) -> str:
+    """Return `table` as a part of a page, the best values bold, intervals below their values."""
+    best = _best(table)
+    said, columns = _said_once(table)
+    lines = ["<section>", f"<h3>{escape(table.title)}</h3>"]
+    lines += [f"<p>Every row: {escape(said)}.</p>"] * bool(said)
+    lines += ['<div class="wide"><table>', "<thead>"]
+    if any(column.over for column in columns):
+        spans = [(over, len(list(same))) for over, same in itertools.groupby(column.over for column in columns)]
+        lines.append("<tr>" + "".join(f'<th class="over" colspan="{n}">{escape(over)}</th>' for over, n in spans))
+    # Numbers are read from the right, and so is what stands above them.
+    sides = ["text" if _is_text(table, column) else "number" for column in columns]
+    heads = (f'<th class="{side}">{escape(c.header)}</th>' for side, c in zip(sides, columns, strict=True))
+    lines += ["<tr>" + "".join(heads), "</thead>", "<tbody>"]
+    for number, row in enumerate(table.rows):
+        cells = []
+        for side, column in zip(sides, columns, strict=True):
+            value, bracket, interval = escape(_text(row.get(column.key), column)).partition(" [")
+            value = f"<b>{value}</b>" if (number, column.key) in best else value
+            below = f'<span class="interval">[{interval}</span>' if bracket and side == "number" else bracket + interval
+            cells.append(f'<td class="{side}">{value}{below}</td>')
+        lines.append("<tr>" + "".join(cells))
+    lines += ["</tbody>", "</table></div>"]
+    if table.notes:
+        lines += ["<ul>", *(f"<li>{escape(note)}</li>" for note in table.notes), "</ul>"]
+    return "\n".join([*lines, "</section>"])
+
+
+def _said_once(table: Table) -> tuple[str, list[Column]]:
+    """Return what every row says of itself, in words, and the columns that are left to print."""
+    shared = {key: _shared(table, key) for key in table.context}
+    said = ", ".join(f"{column.header} {shared[column.key]}" for column in table.columns if shared.get(column.key))
+    return said, [column for column in table.columns if not shared.get(column.key)]
+
+
+def _printed(table: Table, column: Column, best: set[tuple[int, str]]) -> list[str]:
+    """Return header and cells of a column as text of equal lengths, the best values starred."""
+    cells = [
+        _text(row.get(column.key), column) + ("*" if (number, column.key) in best else "")
+        for number, row in enumerate(table.rows)
+    ]
+    size = max(map(len, [column.header, *cells]))
+    align = str.ljust if _is_text(table, column) else str.rjust
+    return [align(cell, size) for cell in [column.header, *cells]]
 
 
 def _fitting(columns: list[list[str]], width: int) -> list[list[list[str]]]:
@@ -188,17 +241,23 @@ def _best(table: Table) -> set[tuple[int, str]]:
     for number, row in enumerate(table.rows):
         groups.setdefault(row.get(table.group), []).append(number)
     for column in table.columns:
-        for numbers in groups.values():
+        rivals = [other for other in table.columns if column.over and other.over and other.header == column.header]
+        contests = (
+            [[(number, other.key) for other in rivals] for number in range(len(table.rows))]
+            if column.over
+            else [[(number, column.key) for number in numbers] for numbers in groups.values()]
+        )
+        for contest in contests:
             badness = {
-                number: _badness(cell.value, column)
-                for number in numbers
-                if isinstance(cell := table.rows[number].get(column.key), Value) and math.isfinite(cell.value)
+                place: _badness(cell.value, column)
+                for place in contest
+                if isinstance(cell := table.rows[place[0]].get(place[1]), Value) and math.isfinite(cell.value)
             }
-            # A single row has nothing to be better than.
-            if column.best is None or len(numbers) < 2 or not badness:
+            # What is alone has nothing to be better than.
+            if column.best is None or len(badness if column.over else contest) < 2 or not badness:
                 continue
             least = min(badness.values())
-            found |= {(number, column.key) for number, value in badness.items() if value == least}
+            found |= {place for place, value in badness.items() if value == least}
     return found
 
 

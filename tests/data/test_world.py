@@ -8,8 +8,19 @@ import pytest
 from mdnvo_jax import geometry
 from mdnvo_jax.data.world import film, pavement, texture, trace, world
 from mdnvo_jax.data.world.motion import FRAME_S, camera_poses, draw_mount, road_coordinate, turn
-from mdnvo_jax.data.world.road import BEHIND_M, LATERAL_MPS2, NODE_M, YAW_RATE_RADPS, build_road, ground, place
+from mdnvo_jax.data.world.road import (
+    BEHIND_M,
+    LATERAL_MPS2,
+    NODE_M,
+    YAW_RATE_RADPS,
+    build_road,
+    clearance_to_side_roads,
+    distance_to_road,
+    ground,
+    place,
+)
 from mdnvo_jax.data.world.style import draw_style
+from mdnvo_jax.data.world.things import CYLINDER, fits
 
 SEEDS = range(60)
 
@@ -172,6 +183,37 @@ def test_nothing_stands_in_the_way():
             assert gap.max(1).min() > 0.1, (seed, index)
 
 
+def test_nothing_fits_on_a_road_that_bends_back():
+    style = draw_style(3)
+    straight = build_road(style, 10, FRAME_S)
+    angle = NODE_M * np.arange(len(straight.x)) / 20
+    circle = straight._replace(
+        x=20 - 20 * np.cos(angle),
+        z=20 * np.sin(angle),
+        heading=angle,
+        curvature=np.full_like(angle, 0.05),
+        side=np.zeros((0, 8)),
+    )
+    # 38 m to the right, across the circle, is the road again, 2 m from its middle.
+    d = np.array([0.0, style.half_width_m - 0.1, style.half_width_m + 0.5, 20.0, 38.0, -30.0])
+    found = fits(style, circle, np.full(len(d), 100.0), d)
+    np.testing.assert_array_equal(found, [False, False, True, True, False, True])
+    assert not fits(style, circle, np.array([100.0]), np.array([style.half_width_m + 0.5]), 0.6)
+
+
+def test_posts_and_trunks_stand_beside_the_roads():
+    tried = 0
+    for seed in range(20):
+        whole = world.build_world(seed, 30)
+        upright = whole.things.shape == CYLINDER
+        x, z = whole.things.centre[upright][:, 0], whole.things.centre[upright][:, 2]
+        s = whole.things.s[upright]
+        assert (distance_to_road(whole.road, x, z, s) > whole.style.half_width_m).all()
+        assert (clearance_to_side_roads(whole.road, x, z, s) > 0).all()
+        tried += len(s)
+    assert tried > 500
+
+
 # Textures
 
 
@@ -223,10 +265,13 @@ def _scene(seed):
     centre = rng.uniform([-20, -4, -5], [20, 2, 60], (len(shape), 3))
     axes = turn(rng.uniform(0, 6, len(shape)), 1) @ turn(rng.uniform(-0.5, 0.5, len(shape)), 2)
     axes = axes * rng.uniform(0.2, 3, (len(shape), 1, 3))
+    # Two walls go by the camera, from ahead of it to behind.
+    for row, x in ((0, -3.0), (1, 4.0)):
+        centre[row], axes[row] = (x, 0.0, 3.0), turn(0.1 * x, 1) @ np.diag([0.3, 1.5, 9.0])
     ball = np.float32(rng.random(len(shape)) < 0.5) * shape
     present = np.isin(np.arange(len(shape)), [*range(count), *range(trace.BOXES, trace.BOXES + count)])
     # None holds the camera.
-    present &= np.linalg.norm(centre, axis=1) > 6
+    present &= (np.linalg.norm(centre, axis=1) > 6) | (np.arange(len(shape)) < 2)
     order = np.argsort(np.linalg.norm(centre, axis=1))
     order = np.concatenate([order[order < trace.BOXES], order[order >= trace.BOXES]])
     columns = (centre, axes, np.linalg.inv(axes), ball, 0 * ball, 1 + 0 * ball, 1.65 + 0 * ball, present)

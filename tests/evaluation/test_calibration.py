@@ -11,7 +11,6 @@ from mdnvo_jax.evaluation import bootstrap
 from mdnvo_jax.evaluation.calibration import (
     RANKED,
     SIGMA_LEVELS,
-    apply_sigma_scale,
     area_under_sparsification_error,
     calibrate,
     fit_sigma_scale,
@@ -228,21 +227,25 @@ class TestSigmaScale:
 
     def test_applied_it_calibrates(self):
         mixture, truth = bimodal()
-        narrowed = apply_sigma_scale(mixture, np.full(6, 0.4))
+        narrowed = density.widen(mixture, np.full(6, 0.4))
         factors = fit_sigma_scale(narrowed, truth)
         np.testing.assert_allclose(factors, 2.5, rtol=0.02)
-        scores = score(apply_sigma_scale(narrowed, factors), truth)
+        scores = score(density.widen(narrowed, factors), truth)
         assert within_sampling(is_inside(scores.pit, 0.6827).mean(axis=0), 0.6827, STEPS)
 
     def test_the_mean_and_the_shape_stay(self):
         mixture, _ = bimodal(steps=3)
         scale = np.array([0.5, 1, 2, 3, 4, 5])
-        widened = apply_sigma_scale(mixture, scale)
+        widened = density.widen(mixture, scale)
         np.testing.assert_allclose(density.mean(widened), density.mean(mixture), rtol=1e-9)
         np.testing.assert_allclose(density.variance(widened), scale**2 * density.variance(mixture), rtol=1e-9)
         point = np.asarray(density.mean(mixture)) + scale * SCALES
         unscaled = np.asarray(density.mean(mixture)) + SCALES
         np.testing.assert_allclose(density.cdf(widened, point), density.cdf(mixture, unscaled), rtol=1e-9)
+
+    def test_a_factor_is_positive(self):
+        with pytest.raises(ValueError, match="factor"):
+            density.widen(bimodal(steps=3)[0], np.array([1, 1, 1, 1, 1, 0.0]))
 
     def test_a_component_without_any_error_stops_at_the_least_factor(self):
         mixture, truth = gaussian(steps=100)

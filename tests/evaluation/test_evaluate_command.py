@@ -12,7 +12,7 @@ from scipy import stats
 
 from mdnvo_jax import evaluate, geometry
 from mdnvo_jax.errors import exit_code
-from mdnvo_jax.evaluation import compare
+from mdnvo_jax.evaluation import commands, compare
 
 
 def drive(count=40, *, error=0.0, scale=1.0, seed=0):
@@ -205,9 +205,9 @@ def test_help_is_there_at_once(arguments):
 def test_the_choices_repeated_for_help_are_those_of_the_library():
     from mdnvo_jax.evaluation import association, bootstrap, formats, trajectory
 
-    assert evaluate.FORMATS == formats.FORMATS
-    assert set(evaluate.ALIGNMENTS) == set(trajectory.ALIGNMENTS)
-    options = evaluate._parser().parse_args(["trajectory", "a", "--reference", "b", "--output", "c"])
+    assert commands.FORMATS == formats.FORMATS
+    assert set(commands.ALIGNMENTS) == set(trajectory.ALIGNMENTS)
+    options = commands.parser().parse_args(["trajectory", "a", "--reference", "b", "--output", "c"])
     assert options.tolerance == association.TIME_TOLERANCE_S and options.block == bootstrap.BLOCK_FRAMES
     assert options.delta_unit in trajectory.DELTA_UNITS
 

@@ -114,7 +114,12 @@ def test_a_checkpoint_on_kitti(workdir, root, tmp_path, capsys):
     assert constant["rpe_rotation_deg"]["mean"]["value"] == pytest.approx(np.rad2deg(0.01), rel=1e-4)
     assert any("mean step of the training split" in note for note in results["tables"][0]["notes"])
     pictures = ("trajectory-06", "uncertainty-06", "sigma_error", "reliability", "sparsification", "pit")
-    assert {path.name for path in output.iterdir()} == {"table.md", "results.json", *(f"{p}.png" for p in pictures)}
+    assert {path.name for path in output.iterdir()} == {
+        "table.md",
+        "report.html",
+        "results.json",
+        *(f"{p}.png" for p in pictures),
+    }
 
 
 @pytest.mark.parametrize(

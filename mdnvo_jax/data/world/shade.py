@@ -18,9 +18,6 @@ from mdnvo_jax.data.world.trace import BOXES, GROUND, SKY, Hit, Shapes
 # Share of a pixel that counts when textures fade: a little less than all, like a sharp lens.
 _SHARPNESS = 0.8
 _OCTAVES, _GAIN = 5, 0.9
-# On a grazing surface a pixel averages a long narrow strip, which leaves some contrast: textures fade by a geometric
-# mean of its length, with this weight, and its width.
-_GRAZING = 0.7
 
 
 class Surface(NamedTuple):
@@ -67,7 +64,7 @@ def radiance(
         jnp.where(away, b, jnp.where(ground, w, m)) for b, w, m in zip(beyond.point, world, skin.metres, strict=True)
     )
     cell = jnp.where(away, beyond.cell, jnp.where(ground, 2.2, paint.grain_m[row]))
-    footprint = jnp.where(away, beyond.footprint, view.width_m ** (1 - _GRAZING) * stretched_m**_GRAZING)
+    footprint = jnp.where(away, beyond.footprint, stretched_m)
     noise = fractal(point, footprint, cell, _GAIN, _OCTAVES, look.seed + 31 * paint.seed[row])
 
     floor = pavement.pave(hit.point, view, stretched_m, noise, lane, look)

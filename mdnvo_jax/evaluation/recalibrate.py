@@ -1,0 +1,151 @@
+"""A sigma scale fitted on the validation split of a training, and nothing else: what `evaluate recalibrate` does.
+
+No sequence can be named: the split is that of the checkpoint's own configuration, so that no test data gets in.
+"""
+
+import argparse
+import dataclasses
+import functools
+import shlex
+import sys
+from collections.abc import Sequence as Many
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from mdnvo_jax import recalibration
+from mdnvo_jax.errors import InputError
+from mdnvo_jax.evaluation.calibration import SIGMA_LEVELS, StepScores, fit_sigma_scale, is_inside, score
+from mdnvo_jax.evaluation.calibration_tables import NOMINAL
+from mdnvo_jax.evaluation.model import track
+from mdnvo_jax.evaluation.tables import Column, Row, Table, Value
+from mdnvo_jax.mixture import Coupling, Mixture, widen
+from mdnvo_jax.recalibration import COMPONENTS, SigmaScale
+
+if TYPE_CHECKING:
+    from mdnvo_jax.config import Config
+    from mdnvo_jax.data.sequence import Sequence
+
+# Fewer steps determine a factor to no better than 7 %: that of a Gaussian is known to 1 / sqrt(2 n).
+_FEW_STEPS = 100
+
+
+def run(options: argparse.Namespace) -> tuple[Table, Path]:
+    """Fit as the options of `evaluate recalibrate` say, write the factors, and return what to print and their file.
+
+    Raises:
+      InputError: the checkpoint has factors already and `--force` is not given, or it or its data is unusable.
+    """
+    from mdnvo_jax import predictor
+    from mdnvo_jax.training import checkpoint
+
+    path = checkpoint.locate(options.checkpoint) / recalibration.FILE
+    if path.exists() and not options.force:
+        raise InputError(f"{path} is there already: fit again with --force")
+    model = predictor.load(options.checkpoint, recalibrated=False)
+    predictions, names = [], []
+    for sequence in validation_sequences(model.config, root=options.root, cache=options.cache):
+        if sequence.count < 2:
+            continue
+        bar = functools.partial(track, name=sequence.name)
+        densities = predictor.predict(model, sequence, mode=options.mode, progress=bar).mixture
+        predictions.append((densities, sequence.steps()))
+        names.append(sequence.name)
+    about = {
+        "split": "validation split of the training",
+        "dataset": model.config.data.dataset,
+        "sequences": names,
+        "mode": options.mode,
+    }
+    found, table = fit(predictions, model.config.model.coupling, about)
+    written = recalibration.write(
+        model.source, found, checkpoint=Path(model.source).name, command=shlex.join(sys.orig_argv)
+    )
+    return table, written
+
+
+def validation_sequences(config: "Config", *, root: str | None, cache: str | None) -> list["Sequence"]:
+    """Return the validation split of a training, at the stride it validated at.
+
+    Args:
+      config: of the training.
+      root: of its data set, where that is not what it was in the training.
+      cache: the same of its cache.
+    """
+    from mdnvo_jax.data import load
+
+    data = config.data
+    if root or cache:
+        data = dataclasses.replace(data, root=root or data.root, cache=cache or "")
+    _, validation, _ = load.load_split(dataclasses.replace(config, data=data))
+    return [_strided(sequence, data.strides[0]) for sequence in validation]
+
+
+def fit(
+    predictions: Many[tuple[Mixture, np.ndarray]], coupling: Coupling, fitted_on: dict[str, Any]
+) -> tuple[SigmaScale, Table]:
+    """Fit the factors of `calibration.fit_sigma_scale` on several sequences, and tabulate what they do to them.
+
+    Args:
+      predictions: of each sequence, densities `[n, M, 6]` and true steps `[n, 6]`.
+      coupling: of the densities.
+      fitted_on: what the predictions are of, to be kept.
+
+    Raises:
+      InputError: there is no step.
+    """
+    if not predictions:
+        raise InputError("the validation split has no step: there is nothing to fit on")
+    leaves: list[Any] = [np.concatenate(parts) for parts in zip(*(density for density, _ in predictions), strict=True)]
+    density = Mixture(*leaves)
+    truth = np.concatenate([steps for _, steps in predictions])
+    scale = fit_sigma_scale(density, truth)
+    before = score(density, truth, coupling=coupling)
+    after = score(widen(density, scale), truth, coupling=coupling)
+    found = SigmaScale(scale, len(truth), float(before.nll.mean()), float(after.nll.mean()), fitted_on)
+    return found, _table(found, before, after)
+
+
+def _table(found: SigmaScale, before: StepScores, after: StepScores) -> Table:
+    """Return a row a component: its factor, and the share of truths inside intervals before and after."""
+    columns = [Column("component", "component"), Column("factor", "sigma times", 3)]
+    for level, nominal in enumerate(NOMINAL):
+        columns += [
+            Column(f"{when}_{level}", f"in {level + 1} sigma, {when} ({nominal:.2f} %)", 1)
+            for when in ("before", "after")
+        ]
+    shares = {
+        f"{when}_{level}": 100 * is_inside(scores.pit, probability).mean(axis=0)
+        for when, scores in (("before", before), ("after", after))
+        for level, probability in enumerate(SIGMA_LEVELS)
+    }
+    rows: list[Row] = [
+        {
+            "component": name,
+            "factor": Value(float(found.scale[k])),
+            **{key: Value(float(values[k])) for key, values in shares.items()},
+        }
+        for k, name in enumerate(COMPONENTS)
+    ]
+    notes = [f"NLL of these steps: {found.nll_before:.3f} before, {found.nll_after:.3f} after (nats a step, m and rad)"]
+    if found.steps < _FEW_STEPS:
+        notes.append(f"{found.steps} steps are few: a factor is known to some {100 / np.sqrt(2 * found.steps):.0f} %")
+    names = ", ".join(found.fitted_on["sequences"])
+    title = f"Sigma scale, fitted on {found.steps} steps of the training's validation split ({names})"
+    return Table(title, columns, rows, notes=notes)
+
+
+def _strided(sequence: "Sequence", stride: int) -> "Sequence":
+    """Return every `stride`-th frame of a sequence."""
+    if stride == 1:
+        return sequence
+    kept = np.arange(0, sequence.count, stride)
+    return dataclasses.replace(
+        sequence,
+        count=len(kept),
+        read=lambda index: sequence.read(stride * index),
+        timestamps=None if sequence.timestamps is None else sequence.timestamps[kept],
+        poses=None if sequence.poses is None else sequence.poses[kept],
+        paths=sequence.paths[::stride],
+    )

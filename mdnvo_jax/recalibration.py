@@ -1,0 +1,85 @@
+"""Factors that a model's sigmas are multiplied by, kept with the checkpoint whose weights they were fitted for."""
+
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from mdnvo_jax import files
+from mdnvo_jax.errors import InputError
+
+# In the folder of a step, so that it is copied and deleted with the weights and never meets others.
+FILE = "sigma_scale.json"
+# Raised when what is stored, or its meaning, changes.
+VERSION = 1
+COMPONENTS = ("tx", "ty", "tz", "rx", "ry", "rz")
+
+
+@dataclass(frozen=True)
+class SigmaScale:
+    """Fitted factors.
+
+    Attributes:
+      scale: by component (tx, ty, tz, rx, ry, rz), `[6]`, positive.
+      steps: how many they were fitted on.
+      nll_before: mean over those steps, nats, m and rad.
+      nll_after: the same with the factors applied.
+      fitted_on: which data, in words and names.
+    """
+
+    scale: np.ndarray
+    steps: int
+    nll_before: float
+    nll_after: float
+    fitted_on: Mapping[str, Any]
+
+
+def read(step_folder: str | Path) -> SigmaScale | None:
+    """Return the factors of a checkpoint, None where none were fitted.
+
+    Raises:
+      InputError: the file is damaged or of another version.
+    """
+    path = Path(step_folder) / FILE
+    if not path.exists():
+        return None
+    mend = "fit again with `evaluate recalibrate --force`, or delete it"
+    try:
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        if stored["version"] != VERSION:
+            raise InputError(f"{path} has version {stored['version']}, expected {VERSION}: {mend}")
+        scale = np.array(stored["scale"], np.float64)
+        found = SigmaScale(
+            scale=scale,
+            steps=int(stored["steps"]),
+            nll_before=float(stored["nll_before"]),
+            nll_after=float(stored["nll_after"]),
+            fitted_on=dict(stored["fitted_on"]),
+        )
+    except InputError:
+        raise
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise InputError(f"{path} is damaged ({type(error).__name__}: {error}): {mend}") from error
+    if scale.shape != (len(COMPONENTS),) or not (np.isfinite(scale) & (scale > 0)).all():
+        raise InputError(f"{path}: scale {scale.tolist()}: expected six factors above 0: {mend}")
+    return found
+
+
+def write(step_folder: str | Path, found: SigmaScale, **about: Any) -> Path:
+    """Write the factors into the folder of a step, whole or not at all, and return the file's path."""
+    path = Path(step_folder) / FILE
+    data = {
+        "version": VERSION,
+        "components": COMPONENTS,
+        "scale": found.scale.tolist(),
+        "steps": found.steps,
+        "nll_before": found.nll_before,
+        "nll_after": found.nll_after,
+        "fitted_on": dict(found.fitted_on),
+        **about,
+    }
+    files.write_text(path, json.dumps(data, indent=2) + "\n")
+    return path
