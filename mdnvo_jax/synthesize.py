@@ -84,7 +84,7 @@ def main(arguments: Sequence[str]) -> None:
             # Last: a sequence that has its poses is whole.
             lines = (" ".join(f"{value:.15e}" for value in pose[:3].ravel()) for pose in drive.poses)
             write_text(root / "poses" / f"{name}.txt", "\n".join(lines) + "\n")
-    print(f"{len(drives)} drives of {options.frames} frames in {root}, laid out like KITTI's odometry benchmark")
+    print(f"{root}: {len(drives)} x {options.frames} frames, laid out like KITTI's odometry benchmark")
 
 
 def _kitti_flow(flow: Any) -> Any:

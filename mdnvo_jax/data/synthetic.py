@@ -91,6 +91,9 @@ def drive(
         raise InputError(f"effects {effects} of a synthetic drive: expected 0 to 10, where 1 is ordinary")
     style, _, poses = world.path(seed, frames)
     rows = film.films(style, effects, FRAME_S * np.arange(frames))
+    poses = geometry.inverse(poses[0]) @ poses
+    # Not only to rounding.
+    poses[0] = np.eye(4)
     look = functools.cache(lambda: jax.device_put(world.look_of(style, channels)))
     kept: collections.OrderedDict[int, np.ndarray] = collections.OrderedDict()
     lock = threading.Lock()
@@ -125,7 +128,7 @@ def drive(
         count=frames,
         read=read,
         timestamps=FRAME_S * np.arange(frames),
-        poses=geometry.inverse(poses[0]) @ poses,
+        poses=poses,
         camera=camera,
     )
 

@@ -131,8 +131,8 @@ def cast(
       camera: (fx, fy, cx, cy).
       size: (height, width) of the frame.
     """
-    corners = shapes.centre[:, None] + jnp.einsum("nij,cj->nci", shapes.axes, _CORNERS)
-    bounds = _bounds(corners @ rotation, _EDGES, camera)
+    corners = shapes.centre[:, None] + _product("nij,cj->nci", shapes.axes, _CORNERS)
+    bounds = _bounds(_product("ncj,jk->nck", corners, rotation), _EDGES, camera)
     table = _table(shapes)
 
     def nearer(best: Array, tile: Array, row: Array, test: Test) -> Array:
@@ -163,12 +163,13 @@ def shadow(
     shapes: Shapes, hit: Hit, sun: Array, rotation: Array, camera: Array, size: tuple[int, int]
 ) -> tuple[Array, Array]:
     """Return (solid, leafy): 1 where a box or cylinder, or a ball, stands between the point seen and the sun."""
-    corners = shapes.centre[:, None] + jnp.einsum("nij,cj->nci", shapes.axes, _CORNERS)
+    corners = shapes.centre[:, None] + _product("nij,cj->nci", shapes.axes, _CORNERS)
     # A shadow ends on the ground: a little deeper than right below the thing, for slopes.
     foot = shapes.floor + 0.5
     drop = jnp.minimum((foot[:, None] - corners[..., 1]) / jnp.maximum(-sun[1], 0.1), 60.0)
     cast_ = corners - drop[..., None] * sun
-    bounds = _bounds(jnp.concatenate([corners, cast_], 1) @ rotation, _SHADOW_EDGES, camera)
+    both = _product("ncj,jk->nck", jnp.concatenate([corners, cast_], 1), rotation)
+    bounds = _bounds(both, _SHADOW_EDGES, camera)
     table = _table(shapes)
     towards = (sun[0], sun[1], sun[2])
 
@@ -274,7 +275,7 @@ def _for_pairs(step: Callable[[Array, Array, Array], Array], start: Array, pairs
 
 def _table(shapes: Shapes) -> Array:
     """Return what `_thing` looks up, a row a thing."""
-    eye = -jnp.einsum("nij,nj->ni", shapes.inverse, shapes.centre)
+    eye = -_product("nij,nj->ni", shapes.inverse, shapes.centre)
     more = jnp.stack([shapes.ball, shapes.leafy, shapes.radius], 1)
     return jnp.concatenate([eye, shapes.inverse.reshape(-1, 9), more], 1)
 
@@ -283,6 +284,11 @@ def _thing(table: Array, row: Array) -> Solid:
     """Return a row of a table, or for an array of rows what each is."""
     x, y, z, a, b, c, d, e, f, g, h, i, *more = (table[:, column][row] for column in range(table.shape[1]))
     return Solid((x, y, z), ((a, b, c), (d, e, f), (g, h, i)), *more)
+
+
+def _product(subscripts: str, a: Array, b: Array | np.ndarray) -> Array:
+    """Return an einsum in full float32: accelerators multiply matrices with fewer digits unless told."""
+    return jnp.einsum(subscripts, a, b, precision=lax.Precision.HIGHEST)
 
 
 def _apply(m: tuple[Vector, ...], p: Vector) -> Vector:
