@@ -1,4 +1,4 @@
-"""MDN-VO on KITTI, to the paper's letter where it speaks ("Implementation Details" and "Experiments on the KITTI Dataset").
+"""MDN-VO on KITTI, to the letter of the paper where it speaks (its sections IV-A and IV-B).
 
     bin/convert_flownet flownets_bn_EPE2.459.pth.tar --output flownet.npz
     bin/prepare_kitti --root KITTI --output CACHE --config configs/mdn_vo_kitti.py
