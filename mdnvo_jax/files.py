@@ -43,11 +43,11 @@ def claim_output(directory: str | os.PathLike[str], *, force: bool) -> Path:
     """
     directory = Path(directory)
     if directory.exists() and not directory.is_dir():
-        raise InputError(f"{directory} is a file; expected a folder to write into: choose another --output")
+        raise InputError(f"{directory} is a file; expected a folder to write into: choose another")
     if directory.is_dir() and any(directory.iterdir()) and not force:
-        raise InputError(f"{directory} holds files already: choose another --output, or overwrite with --force")
+        raise InputError(f"{directory} holds files already: choose another folder, or overwrite with --force")
     try:
         directory.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise InputError(f"cannot make the folder {directory} ({error.strerror}): choose another --output") from error
+        raise InputError(f"cannot make the folder {directory} ({error.strerror}): choose another") from error
     return directory
