@@ -3,7 +3,8 @@
     python -m mdnvo_jax.synthesize drives --sequences 24 --frames 60 --seed 0 --height 48 --width 160
     python -m mdnvo_jax.train configs/demo.py --workdir train --data.root drives
 
-It learns to tell a bend from a straight road and fast from slow, and no more: do not expect it to work on real frames.
+It learns something of the speed and next to nothing of the bends, which take many times as many drives (see
+BENCHMARKS.md): do not expect it to beat the constant predictor everywhere, or to work on real frames.
 """
 
 from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig, TrainingConfig
