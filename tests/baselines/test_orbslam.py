@@ -98,7 +98,7 @@ def stand_in(tmp_path, monkeypatch):
 @pytest.fixture
 def vocabulary(tmp_path):
     path = tmp_path / "words.txt.gz"
-    path.write_bytes(gzip.compress(WORDS.encode()))
+    path.write_bytes(gzip.compress(WORDS.encode(), mtime=0))
     return path
 
 
@@ -365,7 +365,7 @@ def packed(name, content):
     ("name", "content"),
     [
         ("ORBvoc.txt", WORDS.encode()),
-        ("ORBvoc.txt.gz", gzip.compress(WORDS.encode())),
+        ("ORBvoc.txt.gz", gzip.compress(WORDS.encode(), mtime=0)),
         ("ORBvoc.txt.tar.gz", packed("ORBvoc.txt", WORDS.encode())),
     ],
 )
@@ -383,7 +383,7 @@ def test_a_vocabulary_is_unpacked(tmp_path, name, content):
         ("v.txt", b"10 6 0 0\n", "is no vocabulary"),
         ("v.txt", b"\x00\xff" * 5000, "is no vocabulary"),
         ("v.txt.gz", WORDS.encode(), "cannot read the vocabulary"),
-        ("v.txt.gz", gzip.compress(WORDS.encode() * 100)[:40], "cannot read the vocabulary"),
+        ("v.txt.gz", gzip.compress(WORDS.encode() * 100, mtime=0)[:40], "cannot read the vocabulary"),
         ("v.tar.gz", WORDS.encode(), "cannot read the vocabulary"),
         ("v.tar.gz", packed("readme.md", b"hello"), "holds 0 files .txt"),
     ],
