@@ -4,6 +4,9 @@
     python -m mdnvo_jax.train configs/mdn_vo_nuscenes.py --workdir runs/mdn_vo_nuscenes --data.root NUSCENES \
         --training.initial_stack flownet.npz
 
+`bin/prepare_kitti --root NUSCENES --output CACHE --config configs/mdn_vo_nuscenes.py` and `--data.cache CACHE` spare
+the decoding of JPEG in every epoch.
+
 NUSCENES holds samples/CAM_FRONT, sweeps/CAM_FRONT and v1.0-trainval/ (--data.version v1.0-mini for the ten scenes of
 the mini set). The paper defines a split of its own and does not give it; ours is in `mdnvo_jax/data/nuscenes.py`:
 scenes 0572, 0768, 0972 and 0999 of the figures and 20 % of the others are for test, night and rain in every part.

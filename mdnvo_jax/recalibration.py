@@ -10,12 +10,12 @@ import numpy as np
 
 from mdnvo_jax import files
 from mdnvo_jax.errors import InputError
+from mdnvo_jax.odometry import COMPONENTS
 
 # In the folder of a step, so that it is copied and deleted with the weights and never meets others.
 FILE = "sigma_scale.json"
 # Raised when what is stored, or its meaning, changes.
 VERSION = 1
-COMPONENTS = ("tx", "ty", "tz", "rx", "ry", "rz")
 
 
 @dataclass(frozen=True)

@@ -47,8 +47,8 @@ def weights(mixture: Mixture) -> np.ndarray:
 
 
 # Compiled once a shape: most of the time of these tests would go into compiling operation by operation.
-affine, cdf, crps, interval, mean, quantile, strongest, variance = map(
-    jax.jit, (mx.affine, mx.cdf, mx.crps, mx.interval, mx.mean, mx.quantile, mx.strongest, mx.variance)
+affine, cdf, crps, interval, mean, quantile, strongest, variance, widen = map(
+    jax.jit, (mx.affine, mx.cdf, mx.crps, mx.interval, mx.mean, mx.quantile, mx.strongest, mx.variance, mx.widen)
 )
 covariance, log_prob, mode = (
     jax.jit(function, static_argnames="coupling") for function in (mx.covariance, mx.log_prob, mx.mode)
@@ -155,6 +155,7 @@ PUBLIC: dict[str, Callable[[Mixture, jax.Array], object]] = {
     "sample": lambda m, _: mx.sample(m, KEY, (5,)),
     "sample joint": lambda m, _: mx.sample(m, KEY, (5,), coupling="joint"),
     "affine": lambda m, _: mx.affine(m, np.full(m.mean.shape[-1], 1e3), np.ones(m.mean.shape[-1]))[1:],
+    "widen": lambda m, _: mx.widen(m, np.full(m.mean.shape[-1], 1e3))[1:],
     "crps": mx.crps,
 }
 
@@ -516,6 +517,32 @@ def test_affine_changes_units(mixture: Mixture, value: np.ndarray, scale: np.nda
         np.testing.assert_allclose(quantile(moved, 0.2), quantile(original, 0.2) * scale + shift, **close)
 
 
+def test_widening_multiplies_the_deviation_about_the_mean(x64: None) -> None:
+    """By hand: weights 1/4 and 3/4 at -1 and 1 with sigma 1 and 2 have mean 1/2 and variance 3.25 + 0.75 = 4."""
+    two = Mixture(np.log([0.25, 0.75]), np.array([[-1.0], [1.0]]), np.log([[1.0], [2.0]]))
+    found = widen(two, np.array([3.0]))
+    np.testing.assert_allclose(mean(found), [0.5], rtol=1e-12)
+    np.testing.assert_allclose(variance(found), [36.0], rtol=1e-12)
+    np.testing.assert_array_equal(found.logits, two.logits)
+    np.testing.assert_allclose(found.mean, [[0.5 - 4.5], [0.5 + 1.5]], rtol=1e-12)
+    np.testing.assert_allclose(np.exp(found.log_scale), [[3.0], [6.0]], rtol=1e-12)
+
+
+def test_widening_is_by_dimension_and_keeps_the_shape(x64: None) -> None:
+    mixture, value, factor = random_mixture(), random_value(), np.array([0.25, 1.0, 8.0])
+    original, found = device(mixture), widen(device(mixture), factor)
+    centre = reference_mean(mixture)
+    moved_value = centre + factor * (value - centre)
+    np.testing.assert_allclose(mean(found), centre, rtol=1e-12)
+    for coupling in COUPLINGS:
+        scaled = covariance(original, coupling=coupling) * np.outer(factor, factor)
+        np.testing.assert_allclose(covariance(found, coupling=coupling), scaled, rtol=1e-10, atol=1e-10)
+        # The density of what is wider is lower by the Jacobian.
+        expected = log_prob(original, value, coupling=coupling) - np.log(factor).sum()
+        np.testing.assert_allclose(log_prob(found, moved_value, coupling=coupling), expected, rtol=1e-10)
+    np.testing.assert_allclose(cdf(found, moved_value), cdf(original, value), rtol=1e-10)
+
+
 @PROPERTY
 @hypothesis.given(MIXTURES, arrays(2))
 def test_mode_is_the_highest_point(mixture: Mixture, value: np.ndarray) -> None:
@@ -678,6 +705,10 @@ MISTAKES: dict[str, tuple[Callable[[], object], str]] = {
     ),
     "affine shape": (lambda: mx.affine(GOOD, jnp.ones(1), jnp.zeros(3)), r"\(1,\) and \(3,\); expected \(3,\)"),
     "affine sign": (lambda: mx.affine(GOOD, jnp.array([1.0, 0, 1]), jnp.zeros(3)), "expected positive"),
+    "widen shape": (lambda: mx.widen(GOOD, jnp.ones(2)), r"factor has shape \(2,\); expected \(3,\)"),
+    "widen scalar": (lambda: mx.widen(GOOD, 2.0), r"factor has shape \(\); expected \(3,\)"),
+    "widen batch": (lambda: mx.widen(GOOD, jnp.ones((2, 3, 3))), r"\(2, 3, 3\); expected \(3,\)"),
+    "widen sign": (lambda: mx.widen(GOOD, jnp.array([1.0, -1, 1])), "factor is .*expected positive"),
     "outputs of another size": (
         lambda: mx.from_network(jnp.ones(12), 1, floor=1.0),
         r"\(12,\); expected \[\.\.\., 13\]",

@@ -2,6 +2,7 @@
 
 import sys
 from collections import defaultdict
+from collections.abc import Callable
 from collections.abc import Sequence as Many
 from pathlib import Path
 
@@ -53,7 +54,7 @@ def load_split(config: Config) -> tuple[list[Sequence], list[Sequence], ImageCon
     return train, validation, windows.resolve_camera(train, config.image)
 
 
-def kitti_sequences(names: Many[str], config: Config, *, require_poses: bool = True) -> list[Sequence]:
+def kitti_sequences(names: Many[str], config: Config) -> list[Sequence]:
     """Return the KITTI sequences of these names, from the cache where the configuration names one.
 
     A name that leads to a raw drive under `data.root` (2011_09_26/2011_09_26_drive_0001_sync) is read as such.
@@ -61,27 +62,15 @@ def kitti_sequences(names: Many[str], config: Config, *, require_poses: bool = T
     Raises:
       InputError: neither root nor cache is given, or a sequence is missing or malformed.
     """
-    data = config.data
-    _check_unique(names)
-    if data.cache:
-        return cache.read_cache(data.cache, config.image, names)
-    if not data.root:
-        raise InputError("data.root is empty: set it to the folder that holds KITTI's sequences/ and poses/")
-    sequences = []
-    for name in names:
+    data, channels = config.data, config.image.channels
+
+    def read(name: str) -> Sequence:
         if (Path(data.root) / name / "oxts").is_dir():
             folder = f"image_{kitti.camera_number(data.camera_folder, 'image_2'):02d}"
-            sequence = kitti.read_kitti_raw(data.root, name, camera_folder=folder, channels=config.image.channels)
-        else:
-            sequence = kitti.read_kitti(
-                data.root,
-                name,
-                camera_folder=data.camera_folder,
-                channels=config.image.channels,
-                require_poses=require_poses,
-            )
-        sequences.append(sequence)
-    return sequences
+            return kitti.read_kitti_raw(data.root, name, camera_folder=folder, channels=channels)
+        return kitti.read_kitti(data.root, name, camera_folder=data.camera_folder, channels=channels)
+
+    return _by_name(names, config, read, "that holds KITTI's sequences/ and poses/")
 
 
 def nuscenes_sequences(names: Many[str], config: Config) -> list[Sequence]:
@@ -91,13 +80,9 @@ def nuscenes_sequences(names: Many[str], config: Config) -> list[Sequence]:
       InputError: neither root nor cache is given, or a scene is missing or malformed.
     """
     data = config.data
-    _check_unique(names)
-    if data.cache:
-        return cache.read_cache(data.cache, config.image, names)
-    if not data.root:
-        raise InputError("data.root is empty: set it to the folder of nuScenes, which holds samples/ and sweeps/")
-    return [
-        nuscenes.read_nuscenes(
+
+    def read(name: str) -> Sequence:
+        return nuscenes.read_nuscenes(
             data.root,
             name,
             version=data.version,
@@ -105,27 +90,32 @@ def nuscenes_sequences(names: Many[str], config: Config) -> list[Sequence]:
             key_frames_only=data.key_frames_only,
             interpolate=data.interpolate,
         )
-        for name in names
-    ]
+
+    return _by_name(names, config, read, "of nuScenes, which holds samples/ and sweeps/")
 
 
-def _nuscenes_part(part: str, config: Config) -> list[Sequence]:
-    """Return the scenes of one part of the split of nuScenes that can be used; what is left out is said on stderr."""
+def usable_scenes(config: Config, least: int, part: str = "") -> list[Sequence]:
+    """Return the scenes of nuScenes that can be used; what is left out is said on stderr.
+
+    Args:
+      config: says where they are: in a cache or in the data set's own files.
+      least: frames that a scene must have, beside every image of them.
+      part: of the split of `nuscenes`; empty for all of it.
+
+    Raises:
+      InputError: see `nuscenes_sequences`.
+    """
     data = config.data
     unusable: dict[str, list[str]] = defaultdict(list)
     if data.cache:
-        found = [s for s in cache.read_cache(data.cache, config.image) if nuscenes.split_of(s.name) == part]
+        found = [s for s in cache.read_cache(data.cache, config.image) if part in ("", nuscenes.split_of(s.name))]
     else:
         names: list[str] = []
         for scene in nuscenes.scenes(data.root, data.version) if data.root else ():
-            if scene.split == part:
+            if part in ("", scene.split):
                 is_empty = not (scene.key_frames if data.key_frames_only else scene.frames)
                 (unusable["without a frame"] if is_empty else names).append(scene.name)
         found = nuscenes_sequences(names, config)
-    if part == "train":
-        least = 1 + (data.shortest_window or data.window) * min(data.strides, default=1)
-    else:
-        least = 1 + next(iter(data.strides), 1)
     usable = []
     for sequence in found:
         if sequence.count < least:
@@ -134,9 +124,19 @@ def _nuscenes_part(part: str, config: Config) -> list[Sequence]:
             unusable["with images that are not on disk"].append(sequence.name)
         else:
             usable.append(sequence)
-    for reason, scenes in unusable.items():
-        more = ", ..." if len(scenes) > 5 else ""
-        _say(f"nuScenes, {part}: scenes left out, {reason}: {len(scenes)} ({', '.join(scenes[:5])}{more})")
+    for line in nuscenes.left_out(unusable):
+        _say(f"nuScenes{', ' * bool(part)}{part}: {line}")
+    return usable
+
+
+def _nuscenes_part(part: str, config: Config) -> list[Sequence]:
+    """Return the scenes of one part of the split of nuScenes that can be used; see `usable_scenes`."""
+    data = config.data
+    if part == "train":
+        least = 1 + (data.shortest_window or data.window) * min(data.strides, default=1)
+    else:
+        least = 1 + next(iter(data.strides), 1)
+    usable = usable_scenes(config, least, part)
     if not usable:
         raise InputError(
             f"{data.cache or data.root} has no scene of nuScenes for {part} that can be used: name some in "
@@ -179,9 +179,16 @@ def synthetic_sequences(seeds: Many[int], config: Config) -> list[Sequence]:
     ]
 
 
-def _check_unique(names: Many[str]) -> None:
+def _by_name(names: Many[str], config: Config, read: Callable[[str], Sequence], layout: str) -> list[Sequence]:
+    """Return sequences from the cache where the configuration names one, else as `read` reads them from the root."""
+    data = config.data
     if len(set(names)) < len(names):
         raise InputError(f"sequences {' '.join(names)}: expected each name once")
+    if data.cache:
+        return cache.read_cache(data.cache, config.image, names)
+    if not data.root:
+        raise InputError(f"data.root is empty: set it to the folder {layout}")
+    return [read(name) for name in names]
 
 
 def _check_disjoint(train: Many[str], validation: Many[str]) -> None:

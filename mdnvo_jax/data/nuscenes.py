@@ -20,6 +20,8 @@ import dataclasses
 import hashlib
 import itertools
 import re
+from collections.abc import Mapping
+from collections.abc import Sequence as Many
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -218,10 +220,18 @@ def find_gaps(timestamps: np.ndarray, longest_s: float) -> tuple[Gap, ...]:
 
 
 def missing_images(sequence: Sequence) -> list[str]:
-    """Return the paths of a sequence of files that are not on disk, by listing each folder once."""
-    folders = {Path(path).parent for path in sequence.paths}
-    there = {str(path) for folder in folders if folder.is_dir() for path in folder.iterdir()}
-    return [path for path in sequence.paths if path not in there]
+    """Return the paths of a sequence of files that are not on disk."""
+    # One by one: a scene has some hundred images, and its folder those of all the others.
+    return [path for path in sequence.paths if not Path(path).is_file()]
+
+
+def left_out(unusable: Mapping[str, Many[str]]) -> list[str]:
+    """Return a line on the scenes that were left out for each reason, with the names of up to five of them."""
+    return [
+        f"scenes left out, {reason}: {len(names)} ({', '.join(names[:5])}{', ...' if len(names) > 5 else ''})"
+        for reason, names in unusable.items()
+        if names
+    ]
 
 
 def interpolate_poses(times: np.ndarray, poses: np.ndarray, at: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""The command line bin/prepare_kitti: decode and resize KITTI once, so that training never does."""
+"""The command line bin/prepare_kitti: decode and resize KITTI or nuScenes once, so that training never does."""
 
 import argparse
 import dataclasses
@@ -15,11 +15,17 @@ def main(arguments: Sequence[str]) -> None:
     Raises:
       InputError: an argument is unusable, the data are missing or malformed, or the disk is too small.
     """
-    parser = Parser(prog="prepare_kitti", description="Decode and resize KITTI sequences once, for data.cache.")
-    parser.add_argument("--root", required=True, help="folder that holds sequences/ and poses/")
+    parser = Parser(prog="prepare_kitti", description="Decode and resize sequences once, for data.cache.")
+    parser.add_argument("--root", required=True, help="folder that holds sequences/ and poses/, or nuScenes' samples/")
     parser.add_argument("--output", required=True, help="folder to write into; what is finished there is kept")
-    parser.add_argument("--sequences", nargs="+", metavar="NAME", help="such as 00 01 (default: all that have poses)")
+    parser.add_argument("--dataset", choices=("kitti", "nuscenes"), help="kind of data (default: kitti)")
+    parser.add_argument(
+        "--sequences", nargs="+", metavar="NAME", help="such as 00 01 or scene-0061 (default: all that can be used)"
+    )
     parser.add_argument("--camera-folder", metavar="NAME", help="image_0 to image_3 (default: image_2)")
+    parser.add_argument(
+        "--nuscenes-version", dest="version", metavar="NAME", help="such as v1.0-mini (default: v1.0-trainval)"
+    )
     parser.add_argument("--height", type=int, help="rows of the network's input (default: 184)")
     parser.add_argument("--width", type=int, help="columns of the network's input (default: 608)")
     parser.add_argument("--channels", type=int, choices=(1, 3), help="1 for grey, 3 for RGB (default: 3)")
@@ -36,12 +42,19 @@ def main(arguments: Sequence[str]) -> None:
     image = dataclasses.replace(config.image, **_given(options, ("height", "width", "channels")))
     if min(image.height, image.width) < 1:
         raise InputError(f"--height {image.height} --width {image.width}: expected 1 or more")
-    data = dataclasses.replace(config.data, root=options.root, cache="", **_given(options, ("camera_folder",)))
-    names = options.sequences or sorted(path.stem for path in (Path(options.root) / "poses").glob("*.txt"))
-    if not names:
-        raise InputError(f"no poses/*.txt in {options.root}: expected the folder of KITTI's odometry benchmark")
+    given = _given(options, ("dataset", "camera_folder", "version"))
+    data = dataclasses.replace(config.data, root=options.root, cache="", **given)
     config = dataclasses.replace(config, image=image, data=data)
-    sequences = load.kitti_sequences(names, config)
+    names = options.sequences
+    if data.dataset == "nuscenes":
+        sequences = load.nuscenes_sequences(names, config) if names else load.usable_scenes(config, least=2)
+        if not sequences:
+            raise InputError(f"{data.root} has no scene of {data.version} with two frames and all its images on disk")
+    else:
+        names = names or sorted(path.stem for path in (Path(options.root) / "poses").glob("*.txt"))
+        if not names:
+            raise InputError(f"no poses/*.txt in {options.root}: expected the folder of KITTI's odometry benchmark")
+        sequences = load.kitti_sequences(names, config)
     image = windows.resolve_camera(sequences, cache.with_cached_camera(options.output, image))
     total, missing = cache.cache_bytes(sequences, image, options.output)
     free = cache.check_disk(missing, options.output)

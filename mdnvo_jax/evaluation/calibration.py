@@ -17,10 +17,10 @@ from mdnvo_jax import mixture as density
 from mdnvo_jax.errors import InputError
 from mdnvo_jax.evaluation import bootstrap, optional
 from mdnvo_jax.mixture import Coupling, Mixture
+from mdnvo_jax.odometry import COMPONENTS
 
 Reported = Literal["mixture", "strongest"]
 REPORTED: tuple[Reported, ...] = get_args(Reported)
-COMPONENTS = ("tx", "ty", "tz", "rx", "ry", "rz")
 # The six components, then the norms of the translation and of the rotation vector.
 RANKED = (*COMPONENTS, "translation", "rotation")
 

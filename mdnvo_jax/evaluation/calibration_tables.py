@@ -8,7 +8,6 @@ import numpy as np
 
 from mdnvo_jax.evaluation import bootstrap
 from mdnvo_jax.evaluation.calibration import (
-    COMPONENTS,
     RANKED,
     REPORTED,
     SIGMA_LEVELS,
@@ -22,6 +21,7 @@ from mdnvo_jax.evaluation.calibration import (
 )
 from mdnvo_jax.evaluation.tables import Column, Row, Table, Value
 from mdnvo_jax.mixture import Coupling, Mixture
+from mdnvo_jax.odometry import COMPONENTS
 
 _SIGMA_OF: dict[Reported, str] = {"mixture": "whole mixture", "strongest": "strongest component"}
 # What nominal coverage is, in percent; a Gaussian's 1, 2 and 3 sigma.

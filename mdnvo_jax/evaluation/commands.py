@@ -18,7 +18,7 @@ def parser() -> Parser:
     files_help = "judge files of poses, made by anything"
     trajectory = subcommands.add_parser("trajectory", help=files_help, description=files_help)
     add = trajectory.add_argument
-    add("estimates", nargs="+", metavar="ESTIMATE", help="KITTI, frame number + KITTI, TUM, EuRoC csv, or our folder")
+    add("estimates", nargs="+", metavar="ESTIMATE", help="KITTI, frame number + KITTI, TUM, EuRoC csv, or our folders")
     add("--reference", required=True, metavar="FILE", help="the true poses, in any of the same formats")
     add("--align", action="append", default=[], choices=ALIGNMENTS, help="for all, or repeated, one an ESTIMATE [none]")
     add("--format", action="append", default=[], choices=FORMATS, help="for all, or one an ESTIMATE [by content]")

@@ -15,7 +15,7 @@ from mdnvo_jax.evaluation import bootstrap, scoring
 from mdnvo_jax.evaluation import calibration_tables as tabled
 from mdnvo_jax.evaluation.association import TIME_TOLERANCE_S, Paired, pair
 from mdnvo_jax.evaluation.calibration_tables import CalibrationRow
-from mdnvo_jax.evaluation.formats import Format, PoseFile, read_times, read_trajectory
+from mdnvo_jax.evaluation.formats import Format, PoseFile, read_times, read_trajectory, why_lost
 from mdnvo_jax.evaluation.report import CalibrationPictures, PathPicture, Report
 from mdnvo_jax.evaluation.scoring import PathScore
 from mdnvo_jax.evaluation.trajectory import Alignment, DeltaUnit
@@ -26,10 +26,10 @@ CONSTANT = "constant predictor"
 
 @dataclass(frozen=True)
 class Candidate:
-    """An estimate to judge: its name in tables, its poses, and how to align them."""
+    """An estimate to judge: its name in tables, its poses or why there are none, and how to align them."""
 
     name: str
-    poses: PoseFile
+    poses: PoseFile | str
     alignment: Alignment
 
 
@@ -84,7 +84,7 @@ def candidates(
     kinds = _spread(formats, len(paths), None)
     hows = _spread(alignments, len(paths), "none")
     return [
-        Candidate(label, read_trajectory(path, format=kind), how)
+        Candidate(label, why_lost(path) or read_trajectory(path, format=kind), how)
         for label, path, kind, how in zip(labels, paths, kinds, hows, strict=True)
     ]
 
@@ -138,17 +138,22 @@ def compare(
     rows: list[CalibrationRow] = []
     pictures: list[CalibrationPictures] = []
     for estimate in estimates:
+        floor = floors[estimate.alignment]
+        if isinstance(estimate.poses, str):
+            entries.append((scoring.no_path(estimate.name, floor, estimate.alignment), floor))
+            notes.append(f"{estimate.name}: {estimate.poses}")
+            continue
         paired = pair(
             estimate.poses, reference, tolerance_s=tolerance_s, reference_times=times, first_frame=first_frame
         )
         score = scoring.score_path(estimate.name, split, paired, estimate.alignment, delta=delta, unit=unit)
-        entries.append((score, floors[estimate.alignment]))
+        entries.append((score, floor))
         notes.append(f"{estimate.name}: frames matched by {paired.how}")
         if estimate.poses.mixture is not None:
-            found, drawn = _calibrate(estimate, paired, split, block)
+            found, drawn = _calibrate(estimate.name, estimate.poses, paired, split, block)
             rows += found
             pictures.append(drawn)
-    paths = {f"{score.name} ({score.alignment})": score.poses for score, _ in entries}
+    paths = {f"{score.name} ({score.alignment})": score.poses for score, _ in entries if score.covered}
     entries += [(floor, None) for floor in floors.values()]
     notes.append(f"{CONSTANT}: {constant_step.source}")
     table, summaries = scoring.comparison(f"Pose error on {split}", entries, notes, block=block)
@@ -182,29 +187,29 @@ def true_steps(poses: np.ndarray) -> np.ndarray:
 
 
 def _calibrate(
-    estimate: Candidate, paired: Paired, split: str, block: int
+    name: str, poses: PoseFile, paired: Paired, split: str, block: int
 ) -> tuple[list[CalibrationRow], CalibrationPictures]:
     """Calibrate the densities in an output folder on the steps whose two frames are matched."""
-    mixture, rows = estimate.poses.mixture, paired.rows_of_estimate
+    mixture, rows = poses.mixture, paired.rows_of_estimate
     assert mixture is not None
     both = np.flatnonzero(np.diff(rows) == 1)
     if not both.size:
-        raise InputError(f"{estimate.name}: no two consecutive poses are in the reference: check the times")
+        raise InputError(f"{name}: no two consecutive poses are in the reference: check the times")
     truth = geometry.matrix_to_step(
         geometry.inverse(paired.reference[paired.rows_of_reference[both]])
         @ paired.reference[paired.rows_of_reference[both + 1]]
     )
     steps = Mixture(*(leaf[rows[both]] for leaf in mixture))
     found, scores = tabled.calibration_rows(
-        estimate.name,
+        name,
         split,
         [(steps, np.asarray(truth))],
-        coupling=estimate.poses.coupling,
+        coupling=poses.coupling,
         frames=(len(rows), len(paired.reference)),
         block=block,
     )
-    title = f"{estimate.name}, {split}, sigma of the whole mixture, no alignment"
-    return found, CalibrationPictures(f"calibration-{estimate.name}", title, scores[0])
+    title = f"{name}, {split}, sigma of the whole mixture, no alignment"
+    return found, CalibrationPictures(f"calibration-{name}", title, scores[0])
 
 
 def _constant_calibration(step: MeanStep, reference: PoseFile, split: str, block: int) -> list[CalibrationRow]:

@@ -32,6 +32,8 @@ if TYPE_CHECKING:
 Format = Literal["kitti", "indexed", "tum", "euroc", "output"]
 FORMATS: tuple[Format, ...] = get_args(Format)
 
+# What output folders hold: of predict, and of baselines.orbslam.
+_KITTI, _INDEXED, _SUMMARY = "trajectory_kitti.txt", "trajectory_kitti_indexed.txt", "summary.json"
 # Numbers a line of each text format. EuRoC's ground truth has velocities and biases after the first eight: 17 columns.
 _COLUMNS: dict[Format, int] = {"kitti": 12, "indexed": 13, "tum": 8, "euroc": 8}
 _BY_COLUMNS: dict[int, Format] = {12: "kitti", 13: "indexed", 8: "tum"}
@@ -67,7 +69,7 @@ class PoseFile:
 
 
 def read_trajectory(path: str | os.PathLike[str], *, format: Format | None = None) -> PoseFile:
-    """Read a file of poses, or the output folder of `predict`.
+    """Read a file of poses, or the output folder of `predict` or `baselines.orbslam`.
 
     Rotations are projected onto SO(3), since files carry few digits. Lines out of order are sorted by frame number or
     timestamp. Lines that are empty or begin with `#` are skipped.
@@ -105,6 +107,16 @@ def read_trajectory(path: str | os.PathLike[str], *, format: Format | None = Non
     poses = _poses_from_quaternions(path, numbers[:, 1:4], quaternions, positions)
     order = _increasing(path, timestamps, positions, "timestamp")
     return PoseFile(str(path), format, poses[order], timestamps=timestamps[order])
+
+
+def why_lost(path: str | os.PathLike[str]) -> str:
+    """Return why a run of `baselines.orbslam` left no trajectory in the folder `path`; nothing where that is not so.
+
+    Raises:
+      InputError: its summary is damaged.
+    """
+    summary = _read_summary(Path(path) / _SUMMARY)
+    return str(summary.get("failure") or "no trajectory") if summary.get("tracked") == 0 else ""
 
 
 def read_times(path: str | os.PathLike[str]) -> np.ndarray:
@@ -259,14 +271,13 @@ def _poses_from_quaternions(
 
 
 def _read_output(folder: Path) -> PoseFile:
-    """Read the folder that `predict` writes."""
-    kitti, tum, density = (folder / name for name in ("trajectory_kitti.txt", "trajectory_tum.txt", "mixture.npz"))
+    """Read the folder that `predict` or `baselines.orbslam` writes."""
+    kitti, tum, density = (folder / name for name in (_KITTI, "trajectory_tum.txt", "mixture.npz"))
     if not kitti.is_file():
-        indexed = folder / "trajectory_kitti_indexed.txt"
-        if indexed.is_file():
-            return dataclasses.replace(read_trajectory(indexed, format="indexed"), path=str(folder))
-        raise InputError(f"{folder} has no trajectory_kitti.txt: expected an output folder of predict, or a file")
-    summary = _read_summary(folder / "summary.json")
+        if (folder / _INDEXED).is_file():
+            return dataclasses.replace(read_trajectory(folder / _INDEXED, format="indexed"), path=str(folder))
+        raise InputError(f"{folder} has no {_KITTI}: expected an output folder of predict, or a file")
+    summary = _read_summary(folder / _SUMMARY)
     poses = read_trajectory(kitti, format="kitti").poses
     timestamps = None
     # Frames without times are written with their numbers, which are no seconds.

@@ -10,7 +10,7 @@ import functools
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, get_args
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from mdnvo_jax.errors import InputError
 from mdnvo_jax.evaluation import paper_tables, scoring
 from mdnvo_jax.evaluation.association import Paired, pair
 from mdnvo_jax.evaluation.compare import CONSTANT, MeanStep, constant_score
-from mdnvo_jax.evaluation.formats import PoseFile, read_trajectory
+from mdnvo_jax.evaluation.formats import PoseFile, read_trajectory, why_lost
 from mdnvo_jax.evaluation.model import safe, sequences, track
 from mdnvo_jax.evaluation.paper_tables import METHODS, Line
 from mdnvo_jax.evaluation.report import PathPicture, Report, ScenePicture
@@ -35,7 +35,7 @@ KITTI_TEST = ("03", "05", "06", "07", "10")
 KITTI_TRAINING = ("00", "01", "02", "04", "08", "09")
 # Whose trajectories the paper draws.
 KITTI_DRAWN = ("05", "10")
-NUSCENES_DRAWN = {"daylight": "scene-0972", "rain": "scene-0572", "night": "scene-0999"}
+NUSCENES_DRAWN = ("scene-0972", "scene-0572", "scene-0999")
 # A monocular path has no scale of its own.
 ALIGNMENT: dict[str, Alignment] = {"ORB-SLAM": "sim3", "DeepVO": "none", "MDN-VO": "none"}
 _OPTION = {"ORB-SLAM": "orbslam", "DeepVO": "deepvo", "MDN-VO": "mdn"}
@@ -193,9 +193,8 @@ def _read(folder: Path, method: str, drives: Sequence[Drive], drive: Drive) -> t
                 f"for each sequence, such as {places[0].name}"
             )
         return None, f"nothing in {folder}"
-    names = ("trajectory_kitti.txt", "trajectory_kitti_indexed.txt")
-    if (there / "summary.json").is_file() and not any((there / name).is_file() for name in names):
-        return None, f"its run in {there} ended without one"
+    if why := why_lost(there):
+        return None, f"its run in {there} ended without one ({why})"
     return Estimate(pair(read_trajectory(there), drive.truth)), ""
 
 
@@ -232,16 +231,16 @@ def _nuscenes_drives(options: argparse.Namespace, config: "Config | None") -> tu
     version = options.nuscenes_version or config.data.version
     known = nuscenes.scenes(options.root, version)
     usable = [scene for scene in known if (scene.key_frames if config.data.key_frames_only else scene.frames) >= 2]
-    test = [scene for scene in usable if scene.split == "test"]
-    read = {scene.name: sequences(_only(options, scene.name), config)[0] for scene in test}
-    whole = [scene for scene in test if not nuscenes.missing_images(read[scene.name])]
+    read = {scene.name: sequences(_only(options, scene.name), config)[0] for scene in usable if scene.split == "test"}
+    partial = [name for name, sequence in read.items() if nuscenes.missing_images(sequence)]
     drives = []
-    for row in paper_tables.CONDITIONS:
-        for scene in (scene for scene in whole if scene.condition == row):
-            sequence = read[scene.name]
-            assert sequence.poses is not None
-            truth = PoseFile(scene.name, "tum", sequence.poses, timestamps=sequence.timestamps)
-            drives.append(Drive(scene.name, row, truth))
+    for row in get_args(nuscenes.Condition):
+        for scene in known:
+            if scene.name in read and scene.name not in partial and scene.condition == row:
+                sequence = read[scene.name]
+                assert sequence.poses is not None
+                truth = PoseFile(scene.name, "tum", sequence.poses, timestamps=sequence.timestamps)
+                drives.append(Drive(scene.name, row, truth))
     if not drives:
         raise InputError(f"{options.root} has no scene of {version} for test: expected images of v1.0-mini or more")
     paths = [sequences(_only(options, scene.name), config)[0].poses for scene in usable if scene.split == "train"]
@@ -250,10 +249,13 @@ def _nuscenes_drives(options: argparse.Namespace, config: "Config | None") -> tu
         f"mean step of the {len(paths)} scenes for training",
         [drive.truth for drive in drives],
     )
-    left_out = len([scene for scene in known if scene.split == "test"]) - len(drives)
-    notes = [f"{left_out} test scenes are left out: too short, or images not on disk"] if left_out else []
+    short = [scene.name for scene in known if scene.split == "test" and scene.name not in read]
+    unusable = {"of fewer than 2 frames": short, "with images that are not on disk": partial}
+    notes = [f"test: {line}" for line in nuscenes.left_out(unusable)]
     rows = {drive.row for drive in drives}
-    notes += [f"no test scene: {row}" for row in paper_tables.CONDITIONS if row not in rows]
+    notes += [f"no test scene: {row}" for row in paper_tables.PUBLISHED["nuscenes"] if row not in rows]
+    if "unknown" in rows:
+        notes.append("unknown: scenes without a description, which is what tells the condition")
     return drives, step, notes
 
 
@@ -275,9 +277,9 @@ def _drawn(dataset: str, drives: Sequence[Drive]) -> list[Drive]:
     if dataset == "kitti":
         return [drive for drive in drives if drive.name in KITTI_DRAWN] or list(drives)
     chosen = []
-    for row, name in NUSCENES_DRAWN.items():
+    for row in dict.fromkeys(drive.row for drive in drives):
         inside = [drive for drive in drives if drive.row == row]
-        chosen += [drive for drive in inside if drive.name == name] or inside[:1]
+        chosen += [drive for drive in inside if drive.name in NUSCENES_DRAWN] or inside[:1]
     return chosen
 
 
@@ -298,10 +300,10 @@ def _scenes(
         return [], []
     try:
         (sequence,) = sequences(_only(options, options.scene), config)
+        assert sequence.poses is not None
+        found, _ = method(Drive(options.scene, "", PoseFile(options.scene, "tum", sequence.poses)))
     except InputError as error:
         return [], [f"no uncertainty figure: {error}"]
-    assert sequence.poses is not None
-    found, _ = method(Drive(options.scene, "", PoseFile(options.scene, "tum", sequence.poses)))
     if found is None or found.trajectory is None:
         return [], ["no uncertainty figure: --mdn is no checkpoint"]
     recalibrated = "" if found.trajectory.about.get("sigma_scale", "none") == "none" else ", sigma recalibrated"

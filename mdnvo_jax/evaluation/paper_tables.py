@@ -11,7 +11,6 @@ from mdnvo_jax.evaluation.scoring import PathScore
 from mdnvo_jax.evaluation.tables import Cell, Column, Row, Table, Value
 
 METHODS = ("ORB-SLAM", "DeepVO", "MDN-VO")
-CONDITIONS = ("daylight", "rain", "night")
 _ALIGNED = {"ORB-SLAM": "ORB-SLAM (Sim(3)-aligned)"}
 _TITLES = {"kitti": "Table I, KITTI test split", "nuscenes": "Table II, nuScenes test split"}
 _ABOUT = "RPE of the translation in m, delta 1 frame"

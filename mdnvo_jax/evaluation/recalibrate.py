@@ -21,7 +21,8 @@ from mdnvo_jax.evaluation.calibration_tables import NOMINAL
 from mdnvo_jax.evaluation.model import track
 from mdnvo_jax.evaluation.tables import Column, Row, Table, Value
 from mdnvo_jax.mixture import Coupling, Mixture, widen
-from mdnvo_jax.recalibration import COMPONENTS, SigmaScale
+from mdnvo_jax.odometry import COMPONENTS
+from mdnvo_jax.recalibration import SigmaScale
 
 if TYPE_CHECKING:
     from mdnvo_jax.config import Config

@@ -1,5 +1,6 @@
 """The errors of one method on one sequence or several, reduced to statistics with intervals, and to rows of tables."""
 
+import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -76,6 +77,23 @@ def score_path(
     )
 
 
+def no_path(name: str, floor: PathScore, how: Alignment) -> PathScore:
+    """Return the score of a method without a trajectory, on what `floor` is of: the figures in its row are "-"."""
+    figures, frames = np.zeros(0), np.zeros(0, np.int64)
+    return dataclasses.replace(
+        floor,
+        name=name,
+        alignment=how,
+        poses=np.zeros((0, 4, 4)),
+        covered=0,
+        relative=RelativeErrors(figures, figures, frames),
+        absolute_m=figures,
+        segments=Segments(frames, figures, figures, figures, figures, floor.segments.possible),
+        pairs_by_sequence=[0],
+        notes=(),
+    )
+
+
 def pool(parts: Sequence[PathScore], split: str) -> PathScore:
     """Put the errors of one method on several sequences together: every pair, frame and segment counts the same."""
     first = parts[0]
@@ -126,12 +144,10 @@ def summarise(score: PathScore, *, block: int = bootstrap.BLOCK_FRAMES) -> dict[
 
     Returns:
       `rpe_translation_m`, `rpe_rotation_deg`, `ate_m`: statistic to `Value`; `t_rel_percent`, `r_rel_deg_per_100m`:
-      `Value`; `by_length`, `by_speed`: KITTI's averages; and what the row says about itself.
+      `Value`; `by_length`, `by_speed`: KITTI's averages; and what the row says about itself, which is all that there
+      is of a method without a trajectory.
     """
-    draws = bootstrap.draw(score.pairs_by_sequence, block=block)
-    frame_draws = bootstrap.draw_blocks(len(score.absolute_m), block=block)
-    t_rel, r_rel = _segment_values(score.segments, block)
-    return {
+    about = {
         "name": score.name,
         "split": score.split,
         "alignment": score.alignment,
@@ -139,6 +155,17 @@ def summarise(score: PathScore, *, block: int = bootstrap.BLOCK_FRAMES) -> dict[
         "frames_covered": score.covered,
         "frames_total": score.total,
         "pairs": len(score.relative.frames),
+        "by_length": kitti_segments.by_length(score.segments),
+        "by_speed": kitti_segments.by_speed(score.segments),
+        "notes": list(score.notes),
+    }
+    if not score.covered:
+        return about
+    draws = bootstrap.draw(score.pairs_by_sequence, block=block)
+    frame_draws = bootstrap.draw_blocks(len(score.absolute_m), block=block)
+    t_rel, r_rel = _segment_values(score.segments, block)
+    return {
+        **about,
         "rpe_translation_m": _statistic_values(score.relative.translation_m, draws),
         "rpe_rotation_deg": _statistic_values(score.relative.rotation_deg, draws),
         "ate_m": _statistic_values(score.absolute_m, frame_draws),
@@ -146,9 +173,6 @@ def summarise(score: PathScore, *, block: int = bootstrap.BLOCK_FRAMES) -> dict[
         "r_rel_deg_per_100m": r_rel,
         "segments": len(score.segments.start),
         "segments_possible": score.segments.possible,
-        "by_length": kitti_segments.by_length(score.segments),
-        "by_speed": kitti_segments.by_speed(score.segments),
-        "notes": list(score.notes),
     }
 
 
@@ -220,13 +244,14 @@ def comparison(
 
 def path_row(summary: dict[str, Any]) -> Row:
     """Return the row of `COLUMNS` for what `summarise` found."""
-    translation = summary["rpe_translation_m"]
     row: dict[str, Value | str] = {
-        "name": summary["name"],
-        "split": summary["split"],
-        "alignment": summary["alignment"],
-        "delta": summary["delta"],
+        **{key: summary[key] for key in ("name", "split", "alignment", "delta")},
         "frames": f"{summary['frames_covered']} of {summary['frames_total']}",
+    }
+    if not summary["frames_covered"]:
+        return row
+    translation = summary["rpe_translation_m"]
+    row |= {
         "rmse": translation["rmse"],
         "max": Value(translation["max"].value),
         "mean": Value(translation["mean"].value, spread=translation["std"].value),

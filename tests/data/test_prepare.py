@@ -1,12 +1,15 @@
+import dataclasses
 import os
 import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
+from nuscenes_fixture import SCENES, VERSION, write_nuscenes
 
-from mdnvo_jax.config import ImageConfig
-from mdnvo_jax.data import cache, windows
+from mdnvo_jax.config import Config, DataConfig, ImageConfig
+from mdnvo_jax.data import cache, load, windows
 from mdnvo_jax.data.prepare import main
 from mdnvo_jax.errors import InputError
 
@@ -43,6 +46,45 @@ def test_the_config_and_the_options_decide(kitti_root, tmp_path, capsys):
     assert cache.read_cache(tmp_path / "a", ImageConfig(24, 70, 1))[0].read(0).shape == (24, 70, 1)
     main([*arguments, "--output", str(tmp_path / "b"), "--height", "30", "--camera-folder", "image_2"])
     assert cache.read_cache(tmp_path / "b", ImageConfig(30, 70, 1))[0].read(0).shape == (30, 70, 1)
+
+
+def test_nuscenes_is_prepared_for_training(tmp_path, capsys):
+    """What cannot be used is left out and said; training from the cache is training from the files."""
+    root, size = tmp_path / "data", ["--height", "18", "--width", "32"]
+    write_nuscenes(root, SCENES[:6], frames=7)
+    arguments = ["--dataset", "nuscenes", "--nuscenes-version", VERSION, "--root", str(root), *size]
+    main([*arguments, "--output", str(tmp_path / "all")])
+    said = capsys.readouterr()
+    assert "4 sequences, 26 frames as 32x18x3" in said.out
+    assert "scenes left out, of fewer than 2 frames: 1 (scene-0553)" in said.err
+    assert "scenes left out, with images that are not on disk: 1 (scene-0103)" in said.err
+    data = DataConfig("nuscenes", train_sequences=(), window=2)
+    splits = [
+        load.load_split(Config(image=ImageConfig(18, 32), data=dataclasses.replace(data, **source)))[:2]
+        for source in ({"root": str(root), "version": VERSION}, {"cache": str(tmp_path / "all")})
+    ]
+    for files, cached in zip(*splits, strict=True):
+        assert [s.name for s in files] == [s.name for s in cached] and len(files) in (1, 3)
+        np.testing.assert_array_equal(files[0].poses, cached[0].poses)
+        assert cached[0].read(0).shape == (18, 32, 3)
+    # A config says which data set, and scenes can be named.
+    config = tmp_path / "config.py"
+    config.write_text(
+        "from mdnvo_jax.config import *\n"
+        f"config = Config(data=DataConfig('nuscenes', version='{VERSION}', key_frames_only=True))\n"
+    )
+    given = ["--config", str(config), "--root", str(root), "--sequences", "scene-1077", *size]
+    main([*given, "--output", str(tmp_path / "one")])
+    assert [(s.name, s.count) for s in cache.read_cache(tmp_path / "one", ImageConfig(18, 32))] == [("scene-1077", 2)]
+
+
+def test_nuscenes_without_a_scene_to_prepare(tmp_path):
+    write_nuscenes(tmp_path, SCENES[2:3])
+    arguments = ["--dataset", "nuscenes", "--nuscenes-version", VERSION, "--root", str(tmp_path)]
+    with pytest.raises(InputError, match=r"no scene of v1\.0-mini with two frames"):
+        main([*arguments, "--output", str(tmp_path / "c")])
+    with pytest.raises(InputError, match=r"no folder v1\.0-trainval in"):
+        main([*arguments[:2], *arguments[4:], "--output", str(tmp_path / "c")])
 
 
 @pytest.mark.parametrize(

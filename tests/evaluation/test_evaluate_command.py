@@ -11,6 +11,7 @@ import pytest
 from scipy import stats
 
 from mdnvo_jax import evaluate, geometry
+from mdnvo_jax.baselines import orbslam
 from mdnvo_jax.errors import exit_code
 from mdnvo_jax.evaluation import commands, compare
 
@@ -140,6 +141,58 @@ def test_our_own_folder_is_calibrated_too(files, tmp_path):
     assert by_component["rows"][0]["crps"] == pytest.approx(1e3 * rows[0]["crps"]["tx"]["value"])
     written = {path.name for path in (tmp_path / "out" / "calibration-prediction").iterdir()}
     assert written == {"sigma_error.png", "reliability.png", "sparsification.png", "pit.png"}
+
+
+def orbslam_folder(folder, poses, indices):
+    """Write what a run of `baselines.orbslam` writes that tracked the frames `indices` of `poses`."""
+    tracked = orbslam.Tracked(
+        count=len(poses),
+        indices=np.array(indices, np.int64),
+        poses=poses[np.array(indices, np.int64)],
+        kind="final",
+        states=["OK" if index in indices else "NOT_INITIALIZED" for index in range(len(poses))],
+        maps=[(indices[0], indices[-1], len(indices))] if indices else [],
+        track_s=np.zeros(0),
+        settle_s=np.zeros(0),
+        unsettled=0,
+        settings={"features": 2000},
+    )
+    folder.mkdir()
+    orbslam.write(tracked, folder, np.arange(len(poses)), None)
+    return folder
+
+
+def test_a_run_of_orbslam_is_judged_on_the_frames_it_tracked(files, tmp_path, capsys):
+    kept = [index for index in range(40) if index not in (0, 1, 2, 17)]
+    found = orbslam_folder(tmp_path / "found", drive(scale=0.1), kept)
+    lost = orbslam_folder(tmp_path / "lost", drive(), [])
+    given = [found, lost, "--reference", files["truth"], "--align", "sim3", "--output", files["output"]]
+    assert run("trajectory", *given) == 0
+    rows = paths_by_name(files)
+    assert list(rows) == ["found", "lost", "constant predictor"]
+    assert (rows["found"]["frames_covered"], rows["found"]["frames_total"], rows["found"]["pairs"]) == (36, 40, 34)
+    assert rows["found"]["alignment"] == "sim3, scale 10"
+    assert rows["found"]["rpe_translation_m"]["rmse"]["value"] < 1e-6
+    assert (rows["lost"]["frames_covered"], rows["lost"]["frames_total"], rows["lost"]["pairs"]) == (0, 40, 0)
+    printed = capsys.readouterr().out
+    assert "36 of 40" in printed and "found: frames matched by frame number" in printed
+    assert "lost: no trajectory: ORB-SLAM did not initialise (40 frames, 2000 features)" in printed
+    row = f"| lost | truth | sim3 | 1 frame | 0 of 40 |{' - |' * 8}\n"
+    assert row in Path(files["output"], "table.md").read_text(encoding="utf-8")
+    options = commands.parser().parse_args(["trajectory", *map(str, given)])
+    assert list(compare.from_options(options).pictures[0].paths) == ["found (sim3, scale 10)"]
+
+
+def test_a_lost_run_alone_is_a_row_too_but_no_truth(files, tmp_path, capsys):
+    lost = orbslam_folder(tmp_path / "lost", drive(), [])
+    assert run("trajectory", lost, "--reference", files["truth"], "--output", files["output"]) == 0
+    assert "0 of 40" in capsys.readouterr().out
+    assert Path(files["output"], "trajectory.png").stat().st_size > 5000
+    assert run("trajectory", files["good"], "--reference", lost, "--output", tmp_path / "other") == 2
+    assert "has no trajectory_kitti.txt" in capsys.readouterr().err
+    (lost / "summary.json").write_text("{")
+    assert run("trajectory", lost, "--reference", files["truth"], "--output", tmp_path / "another") == 2
+    assert capsys.readouterr().err.startswith("error: ")
 
 
 def test_delta_and_unit(files):

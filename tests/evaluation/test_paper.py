@@ -10,7 +10,8 @@ import pytest
 from mdnvo_jax import evaluate as command
 from mdnvo_jax import geometry, recalibration
 from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig
-from mdnvo_jax.errors import exit_code
+from mdnvo_jax.errors import InputError, exit_code
+from mdnvo_jax.evaluation import commands, paper
 from mdnvo_jax.evaluation.paper_tables import METHODS, PUBLISHED, published_table
 from mdnvo_jax.evaluation.tables import as_markdown
 from mdnvo_jax.model.head import Labels
@@ -70,7 +71,8 @@ def kitti(tmp_path):
     path[:, :3, 3] *= 0.1
     write(tmp_path / "orbslam" / "03" / "trajectory_kitti_indexed.txt", path[2:], np.arange(2, 40))
     (tmp_path / "orbslam" / "10").mkdir()
-    (tmp_path / "orbslam" / "10" / "summary.json").write_text("{}")
+    lost = {"tracked": 0, "failure": "no trajectory: ORB-SLAM did not initialise"}
+    (tmp_path / "orbslam" / "10" / "summary.json").write_text(json.dumps(lost))
     return tmp_path
 
 
@@ -96,7 +98,8 @@ def test_table_one_from_files(kitti, capsys):
     assert rows["mean"]["MDN-VO rmse"] == pytest.approx(0.1, abs=1e-6)
     assert rows["mean"]["DeepVO rmse"] is None and rows["mean"]["ORB-SLAM rmse"] is None
     notes = "\n".join(table["notes"])
-    assert f"ORB-SLAM has no trajectory of 10: its run in {kitti / 'orbslam' / '10'} ended without one" in notes
+    why = "ended without one (no trajectory: ORB-SLAM did not initialise)"
+    assert f"ORB-SLAM has no trajectory of 10: its run in {kitti / 'orbslam' / '10'} {why}" in notes
     assert "DeepVO has no trajectory of 03" in notes and "training sequences 00" in notes
     # Of the figures of the paper that of 10 is there.
     assert [path.name for path in output.glob("*.png")] == ["trajectory-10.png"]
@@ -181,6 +184,7 @@ def test_table_two_by_condition(nuscenes, tmp_path, capsys):
     ]
     assert "MDN-VO frames" not in rows["daylight"]
     assert any("scenes for training" in note for note in table["notes"])
+    assert not any("left out" in note or "unknown" in note or "no test scene" in note for note in table["notes"])
     drawn = {path.name for path in (tmp_path / "out").glob("*.png")}
     assert drawn == {f"trajectory-scene-{n}.png" for n in ("0972", "0572", "0999")} | {"uncertainty-scene-0768.png"}
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
@@ -199,6 +203,50 @@ def test_any_scene_can_be_chosen(nuscenes, tmp_path, capsys):
     assert "MDN-VO has no trajectory of scene-0572" in printed
     rows, _ = rows_of(tmp_path / "out")
     assert rows["rain"]["MDN-VO rmse"] is None and rows["night"]["MDN-VO rmse"] > 0
+
+
+def test_scenes_of_unknown_condition_have_a_row_and_what_is_left_out_is_named(tmp_path):
+    scenes = (
+        nuscenes_fixture.Spec("scene-0061", "Parked lorry"),
+        nuscenes_fixture.Spec("scene-0999", "Night, a lit crossing"),
+        nuscenes_fixture.Spec("scene-0002", ""),
+        nuscenes_fixture.Spec("scene-0025", " "),
+        nuscenes_fixture.Spec("scene-0011", "Short", frames=1),
+        nuscenes_fixture.Spec("scene-0014", "Gone", missing=(2,)),
+    )
+    nuscenes_fixture.write_nuscenes(tmp_path, scenes, frames=6)
+    given = ["--dataset", "nuscenes", "--root", tmp_path, "--nuscenes-version", nuscenes_fixture.VERSION]
+    assert run(*given, "--output", tmp_path / "out") == 0
+    rows, table = rows_of(tmp_path / "out")
+    assert [(name, row["drives"], row["frames"]) for name, row in rows.items()] == [
+        ("night", "1", "6"),
+        ("unknown", "2", "12"),
+    ]
+    assert rows["unknown"]["constant predictor rmse"] > 0
+    said = [note for note in table["notes"] if "condition" in note or "scene" in note]
+    assert said[:5] == [
+        "test: scenes left out, of fewer than 2 frames: 1 (scene-0011)",
+        "test: scenes left out, with images that are not on disk: 1 (scene-0014)",
+        "no test scene: daylight",
+        "no test scene: rain",
+        "unknown: scenes without a description, which is what tells the condition",
+    ]
+    drawn = {path.name for path in (tmp_path / "out").glob("*.png")}
+    assert drawn == {"trajectory-scene-0999.png", "trajectory-scene-0002.png"}
+
+
+@pytest.mark.parametrize(("scene", "why"), [("scene-0103", "cannot be read"), ("scene-9999", "no scene scene-9999")])
+def test_a_scene_that_cannot_be_drawn_costs_its_figure_alone(nuscenes, scene, why):
+    root, _ = nuscenes
+    arguments = ["paper", "--dataset", "nuscenes", "--root", str(root), "--scene", scene]
+    config = Config(data=DataConfig(dataset="nuscenes", version=nuscenes_fixture.VERSION))
+
+    def method(drive):
+        raise InputError(f"an image of {drive.name} cannot be read")
+
+    pictures, notes = paper._scenes(commands.parser().parse_args(arguments), config, method)
+    assert pictures == [] and len(notes) == 1
+    assert notes[0].startswith("no uncertainty figure: ") and why in notes[0]
 
 
 @pytest.mark.parametrize(
