@@ -41,6 +41,9 @@ class ModelConfig:
 
     # Multiplies the channels 64..1024 of the paper's stack.
     width: float = 1.0
+    # "float32", or "mixed": factors of the convolutions' products rounded to bfloat16, summed in float32, on GPU, TPU
+    # and processors with AMX. Not given in the paper.
+    products: Literal["float32", "mixed"] = "float32"
     # Paper: dropout 0.1 on the convolutions.
     conv_dropout: float = 0.1
     # Units a direction, and layers, of the LSTM. Not given in the paper; DeepVO has two layers of 1000.

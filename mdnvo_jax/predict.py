@@ -26,20 +26,35 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument(
         "--estimate", choices=("mean", "strongest"), default="mean", help="what a mixture is reported by"
     )
+    parser.add_argument(
+        "--backend",
+        choices=("jax", "openvino"),
+        default="jax",
+        help="what computes the convolutions; openvino: on a processor (pip install 'mdnvo_jax[openvino]')",
+    )
+    parser.add_argument(
+        "--precision", choices=("float32", "bfloat16"), default="float32", help="of the products in the convolutions"
+    )
     parser.add_argument("--no-recalibration", action="store_true", help="sigmas as the network gave them")
     options = parser.parse_args(arguments)
     if options.stride < 1:
         raise InputError(f"--stride is {options.stride}: expected 1 or more")
     output = files.claim_output(options.output, force=options.force)
 
-    from mdnvo_jax import predictor
+    from mdnvo_jax import compilation, predictor
     from mdnvo_jax.data.folder import read_frames
     from mdnvo_jax.training import logs
 
     def bar(chunks: Iterator[Any], total: int) -> Iterator[Any]:
         return logs.track(chunks, "predicting", total)
 
-    model = predictor.load(options.checkpoint, recalibrated=not options.no_recalibration)
+    compilation.keep_compiled()
+    model = predictor.load(
+        options.checkpoint,
+        recalibrated=not options.no_recalibration,
+        backend=options.backend,
+        precision=options.precision,
+    )
     frames = read_frames(
         options.images,
         model.config.image.channels,

@@ -1,7 +1,7 @@
 """One frame in, one step out: causal prediction in constant memory, as a pure function of an explicit state."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -9,19 +9,20 @@ import jax.numpy as jnp
 from mdnvo_jax import mixture
 from mdnvo_jax.config import Config
 from mdnvo_jax.mixture import Mixture
-from mdnvo_jax.model.head import Labels, mixture_from_outputs
-from mdnvo_jax.model.network import Network
-from mdnvo_jax.training.state import Model
+from mdnvo_jax.model.convolution import Products
+from mdnvo_jax.model.fold import Folded, folded_stack, gates_size, normalised_frames, pair_gates, window_densities
+from mdnvo_jax.model.head import Labels
 
 
 class StreamState(NamedTuple):
     """What is remembered between frames.
 
     Attributes:
-      image: the last frame, `[H, W, C]` uint8.
+      image: the last frame as the network reads it, `[H, W, C]` float32.
       usable: whether it was readable.
       seen: whether there was one at all.
-      features: of the last pairs of frames, oldest first, `[window, F]`.
+      gates: of the last pairs of frames, oldest first, `[window, G]`: what the LSTM's first layer makes of their
+        features.
       mask: which of them are real, `[window]`.
       mean: the last estimated step, `[6]`, held where a frame is unusable.
       variance: of that estimate, `[6]`.
@@ -30,7 +31,7 @@ class StreamState(NamedTuple):
     image: jax.Array
     usable: jax.Array
     seen: jax.Array
-    features: jax.Array
+    gates: jax.Array
     mask: jax.Array
     mean: jax.Array
     variance: jax.Array
@@ -71,56 +72,70 @@ def held_step(mean: jax.Array, variance: jax.Array, labels: Labels, components: 
     )
 
 
-def stream(
-    network: Network, config: Config, window: int, sigma_scale: jax.Array | None = None
-) -> tuple[
-    Callable[[Model], StreamState], Callable[[Model, StreamState, jax.Array, jax.Array], tuple[StreamState, StreamStep]]
-]:
-    """Return `start(model) -> state` and `step(model, state, image, usable) -> (state, step)`.
+class Stream(NamedTuple):
+    """What runs a stream; pure functions, which can be jitted and vmapped over cameras.
 
-    Both are pure and can be jitted and vmapped over cameras. Every frame pair goes through the convolutions once; the
-    LSTM runs over the last `window` pairs, so that a step depends on no frame that is older.
+    Attributes:
+      start: (model) -> the state before the first frame.
+      step: (model, state, image, usable) -> (state, step): what a frame `[H, W, C]` uint8 adds; `usable` false says
+        that it could not be read.
+      pair: (state, image) -> (frame, pair): the first part of a step, the image as the network reads it and the pair
+        `[H, W, 2C]` that it makes with the last.
+      advance: (model, state, frame, usable, features) -> (state, step): the last part, after the convolutions have
+        made features `[F]` of the pair.
+    """
+
+    start: Callable[[Folded], StreamState]
+    step: Callable[[Folded, StreamState, Any, Any], tuple[StreamState, StreamStep]]
+    pair: Callable[[StreamState, Any], tuple[jax.Array, jax.Array]]
+    advance: Callable[[Folded, StreamState, Any, Any, Any], tuple[StreamState, StreamStep]]
+
+
+def stream(config: Config, window: int, sigma_scale: jax.Array | None = None, products: Products = "float32") -> Stream:
+    """Return the functions that run a stream.
+
+    Every frame pair goes through the convolutions once; the LSTM runs over the last `window` pairs, so that a step
+    depends on no frame that is older.
 
     Args:
-      network: from `build`.
       config: the experiment the model comes from.
       window: pairs remembered; the length the network was trained with is the natural choice.
       sigma_scale: factors `[6]` that every sigma is multiplied by, if any.
+      products: of the convolutions, see `convolution`.
     """
     shape = (config.image.height, config.image.width, config.image.channels)
 
-    def pair_features(model: Model, first: jax.Array, second: jax.Array) -> jax.Array:
-        variables = {"params": model.params, "batch_stats": model.batch_stats}
-        return network.apply(variables, first[None], second[None], method="pair_features")[0]
-
-    def start(model: Model) -> StreamState:
-        frame = jax.ShapeDtypeStruct(shape, jnp.uint8)
-        features = jax.eval_shape(pair_features, model, frame, frame)
+    def start(model: Folded) -> StreamState:
         return StreamState(
-            image=jnp.zeros(shape, jnp.uint8),
+            image=jnp.zeros(shape, jnp.float32),
             usable=jnp.array(False),
             seen=jnp.array(False),
-            features=jnp.zeros((window, *features.shape), features.dtype),
+            gates=jnp.zeros((window, gates_size(model)), jnp.float32),
             mask=jnp.zeros(window, bool),
             mean=jnp.asarray(model.labels.mean),
             variance=jnp.zeros(6),
         )
 
-    def step(model: Model, state: StreamState, image: jax.Array, usable: jax.Array) -> tuple[StreamState, StreamStep]:
+    def pair(state: StreamState, image: jax.Array) -> tuple[jax.Array, jax.Array]:
+        frame = normalised_frames(jnp.asarray(image), config.image)
+        return frame, jnp.concatenate([state.image, frame], axis=-1)
+
+    def advance(
+        model: Folded, state: StreamState, frame: jax.Array, usable: jax.Array, features: jax.Array
+    ) -> tuple[StreamState, StreamStep]:
         pair_usable = state.seen & state.usable & usable
-        features = jnp.concatenate([state.features[1:], pair_features(model, state.image, image)[None]])
+        gates = jnp.concatenate([state.gates[1:], pair_gates(model, features[None])])
         mask = jnp.concatenate([state.mask[1:], pair_usable[None]])
-        variables = {"params": model.params, "batch_stats": model.batch_stats}
-        outputs = network.apply(variables, features[None], mask[None], method="outputs_from_features")[0, -1]
-        seen_step = mixture_from_outputs(outputs, model.labels, config.model, model.residual_scale, sigma_scale)
+        windows = window_densities(model, gates[None], mask[None], config.model, sigma_scale)
+        seen_step = jax.tree.map(lambda leaf: leaf[0, -1], windows)
         held = held_step(state.mean, state.variance, model.labels, seen_step.logits.shape[-1])
         density = jax.tree.map(lambda seen, other: jnp.where(pair_usable, seen, other), seen_step, held)
         mean = mixture.mean(density)
         following = StreamState(
-            image=jnp.where(usable, image, state.image),
-            usable=usable,
+            image=jnp.where(usable, frame, state.image),
+            usable=jnp.asarray(usable),
             seen=jnp.array(True),
-            features=features,
+            gates=gates,
             mask=mask,
             mean=jnp.where(pair_usable, mean, state.mean),
             variance=jnp.where(pair_usable, mixture.variance(density), state.variance),
@@ -128,4 +143,8 @@ def stream(
         covariance = mixture.covariance(density, coupling=config.model.coupling)
         return following, StreamStep(mean, covariance, density, state.seen & ~pair_usable, state.seen)
 
-    return start, step
+    def step(model: Folded, state: StreamState, image: jax.Array, usable: jax.Array) -> tuple[StreamState, StreamStep]:
+        frame, stacked = pair(state, image)
+        return advance(model, state, frame, usable, folded_stack(model.stack, stacked[None], products)[0])
+
+    return Stream(start, step, pair, advance)

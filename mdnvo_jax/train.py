@@ -17,8 +17,10 @@ def main(arguments: Sequence[str]) -> None:
     options = parser.parse_args(arguments)
     config = configuration.apply_overrides(configuration.load_config(options.config), options)
 
+    from mdnvo_jax import compilation
     from mdnvo_jax.training import loop
 
+    compilation.keep_compiled()
     try:
         print(loop.train(config, Path(options.workdir), resume=options.resume))
     except loop.NonFiniteError as error:

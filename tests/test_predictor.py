@@ -80,9 +80,10 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def direct(model: predictor.Predictor, first_step: int, last_step: int) -> Mixture:
-    """Return what the network says of one window, frames in, without any machinery in between."""
+    """Return what the network as trained says of one window, frames in, without any machinery in between."""
     network = build(CONFIG.image, CONFIG.model)
-    variables = {"params": model.model.params, "batch_stats": model.model.batch_stats}
+    trained = predictor.trained(model.source)[0]
+    variables = {"params": trained.params, "batch_stats": trained.batch_stats}
     images = FRAMES[None, first_step : last_step + 1]
     outputs = network.apply(variables, images, jnp.ones((1, last_step - first_step), bool), train=False)
     return mixture_from_outputs(outputs[0], model.model.labels, CONFIG.model)
@@ -100,9 +101,9 @@ def test_offline_every_step_is_that_of_its_window(model: predictor.Predictor) ->
 def test_every_pair_goes_through_the_convolutions_once(model: predictor.Predictor) -> None:
     seen = []
 
-    def counting(parameters: object, first: np.ndarray, second: np.ndarray) -> jax.Array:
-        seen.extend(zip(first[:, 0, 0, 0], second[:, 0, 0, 0], strict=True))
-        return model.features(parameters, first, second)
+    def counting(parameters: object, frames: np.ndarray) -> jax.Array:
+        seen.extend(zip(frames[:-1, 0, 0, 0], frames[1:, 0, 0, 0], strict=True))
+        return model.features(parameters, frames)
 
     numbered = np.broadcast_to(np.arange(12, dtype=np.uint8)[:, None, None, None], FRAMES.shape)
     predictor.predict(model._replace(features=counting), numbered, hop=1)
@@ -150,6 +151,7 @@ def test_the_first_frame_may_be_bad_too(model: predictor.Predictor, folder: Path
     (tmp_path / "frame0.png").write_bytes(b"")
     for mode in ("offline", "streaming"):
         path = predictor.predict(model, tmp_path, mode=mode, bad_frames="hold")
+        assert set(path.about["ms_per_frame"]) == {"read", "wait", "network"}
         assert [bool(flag) for flag in path.flags] == [True] + [False] * 10
         np.testing.assert_allclose(path.steps[0], LABELS.mean, atol=1e-6)
 
@@ -166,6 +168,22 @@ def test_a_stream_is_a_pure_function_that_vmaps_over_cameras(model: predictor.Pr
     assert not np.allclose(found.mean[0], found.mean[1])
     np.testing.assert_allclose(alone.mean, mixture.mean(alone.mixture), atol=1e-6)
     assert bool(alone.valid)
+
+
+def test_a_frame_of_another_size_is_refused(model: predictor.Predictor) -> None:
+    for image in (np.zeros((32, 63, 1), np.uint8), np.zeros((32, 64, 3), np.uint8)):
+        with pytest.raises(ValueError, match=r"expected \(32, 64, 1\)"):
+            model.stream_step(model.model, model.stream_start(model.model), image, True)
+
+
+def test_the_command_line_does_not_take_the_place_of_the_function() -> None:
+    import mdnvo_jax.predict
+    from mdnvo_jax import predict
+    from mdnvo_jax.predict import main
+
+    assert predict is predictor.predict is mdnvo_jax.predict
+    assert main.__module__ == "mdnvo_jax.predict"
+    assert mdnvo_jax.mixture is mixture
 
 
 def test_the_camera_brings_frames_to_that_of_the_training(model: predictor.Predictor) -> None:
@@ -190,6 +208,12 @@ def test_the_camera_brings_frames_to_that_of_the_training(model: predictor.Predi
 def test_unusable_frames_are_named(model: predictor.Predictor, frames: object, message: str) -> None:
     with pytest.raises(InputError, match=message):
         predictor.predict(model, frames)
+
+
+@pytest.mark.parametrize("hop", [0, 5])
+def test_windows_that_leave_steps_out_are_refused(model: predictor.Predictor, hop: int) -> None:
+    with pytest.raises(InputError, match=f"hop is {hop}: expected 1 to 4"):
+        predictor.predict(model, FRAMES, hop=hop)
 
 
 def test_a_checkpoint_that_is_none_or_does_not_fit_is_named(workdir: Path, tmp_path: Path) -> None:

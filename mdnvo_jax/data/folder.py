@@ -2,6 +2,7 @@
 
 import dataclasses
 import glob
+import os
 import re
 import threading
 from collections.abc import Sequence as Many
@@ -72,6 +73,40 @@ def read_frames(
         timestamps=None if sequence.timestamps is None else sequence.timestamps[::stride],
         paths=[sequence.label(index) for index in kept],
     )
+
+
+def as_sequence(
+    frames: str | os.PathLike[str] | Sequence | np.ndarray,
+    channels: int,
+    *,
+    stride: int = 1,
+    timestamps: np.ndarray | None = None,
+    camera: Camera | None = None,
+) -> Sequence:
+    """Return frames in whatever form they were given as a sequence.
+
+    Args:
+      frames: what `read_frames` reads, or a sequence, or an array `[N, H, W]` or `[N, H, W, C]` of uint8.
+      channels: 3 for RGB, 1 for grey.
+      stride: takes every `stride`-th frame, but for a sequence.
+      timestamps: of the frames taken, s, but for a sequence.
+      camera: fx, fy, cx, cy of the frames in pixels.
+
+    Raises:
+      InputError: the array is of another type, shape or number of channels, or see `read_frames`.
+    """
+    if isinstance(frames, (str, os.PathLike)):
+        found = read_frames(os.fspath(frames), channels, stride=stride, camera=camera)
+        return found if timestamps is None else dataclasses.replace(found, timestamps=timestamps)
+    if isinstance(frames, Sequence):
+        return frames if camera is None else dataclasses.replace(frames, camera=camera)
+    images = np.asarray(frames)
+    if images.ndim not in (3, 4) or images.dtype != np.uint8:
+        raise InputError(f"frames are {images.dtype} {images.shape}: expected uint8 [N, H, W] or [N, H, W, C]")
+    images = images.reshape(*images.shape[:3], -1)[::stride]
+    if images.shape[-1] != channels:
+        raise InputError(f"frames have {images.shape[-1]} channels: the model expects {channels}")
+    return Sequence(name="array", count=len(images), read=images.__getitem__, timestamps=timestamps, camera=camera)
 
 
 def natural_key(text: str) -> tuple[list[tuple[int, int, str]], str]:
@@ -216,4 +251,5 @@ def _video(path: Path, channels: int) -> Sequence:
         read=video.read,
         timestamps=np.arange(video.count) / rate if np.isfinite(rate) and rate > 0 else None,
         paths=[f"{path}: frame {index}" for index in range(video.count)],
+        in_order=True,
     )

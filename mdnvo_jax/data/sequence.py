@@ -25,6 +25,7 @@ class Sequence:
       poses: `T_world_camera` of every frame, `[N, 4, 4]`, m, float64, rotations in SO(3), or None.
       camera: intrinsics of the decoded frame, or None.
       paths: what to call each frame in a message, `N` names, or empty: the name and the index are used.
+      in_order: whether frames are cheap to read in order only, as those of a video are.
 
     Raises:
       InputError: timestamps, poses or paths are not one a frame, or are not finite.
@@ -37,6 +38,7 @@ class Sequence:
     poses: np.ndarray | None = None
     camera: Camera | None = None
     paths: abc.Sequence[str] = ()
+    in_order: bool = False
 
     def __post_init__(self) -> None:
         for what, values, shape in (("timestamps", self.timestamps, ()), ("poses", self.poses, (4, 4))):

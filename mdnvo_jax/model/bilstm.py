@@ -11,11 +11,14 @@ Parameters: `{"layer0": {"forward": direction, "backward": direction}, "layer1":
 a direction being `{"input_kernel": [F, 4H], "recurrent_kernel": [H, 4H], "bias": [4H]}`: the transposes of torch's.
 """
 
-from typing import Any
+import functools
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
+
+from mdnvo_jax.model.dropout import drop
 
 _GATES = 4
 
@@ -79,35 +82,123 @@ def bilstm(params: LstmParams, inputs: Array, mask: Array, *, dropout: float = 0
       The outputs of the last layer, forward then backward on the last axis: `[B, T, 2 * H]`, or `[B, T, H]` if causal.
       Zero in masked steps.
     """
+    return bilstm_from_gates(params, input_gates(params, inputs), mask, dropout=dropout, rng=rng)
+
+
+def input_gates(params: LstmParams, inputs: Array) -> Array:
+    """Return what inputs `[..., F]` add to the gates of the first layer, W x + b, `[..., directions * 4H]`.
+
+    It depends on no other step: prediction computes it once for a pair of frames that lies in several windows.
+    """
+    return _input_gates(params["layer0"], inputs)
+
+
+def bilstm_from_gates(
+    params: LstmParams, gates: Array, mask: Array, *, dropout: float = 0.0, rng: Array | None = None
+) -> Array:
+    """Return what `bilstm` does, from `input_gates` `[B, T, directions * 4H]` instead of the inputs."""
+    outputs = gates
     for layer in range(len(params)):
         directions = params[f"layer{layer}"]
-        outputs = [_lstm(directions["forward"], inputs, mask, reverse=False)]
+        if layer > 0:
+            gates = _input_gates(directions, outputs)
+        parts = jnp.split(gates, len(directions), axis=-1)
+        layer_outputs = [_lstm(directions["forward"], parts[0], mask, reverse=False)]
         if "backward" in directions:
-            outputs.append(_lstm(directions["backward"], inputs, mask, reverse=True))
-        inputs = jnp.concatenate(outputs, axis=-1)
+            layer_outputs.append(_lstm(directions["backward"], parts[1], mask, reverse=True))
+        outputs = jnp.concatenate(layer_outputs, axis=-1)
         if rng is not None and dropout > 0:
-            kept = jax.random.bernoulli(jax.random.fold_in(rng, layer), 1 - dropout, inputs.shape)
-            inputs = jnp.where(kept, inputs / (1 - dropout), jnp.zeros_like(inputs))
-    return inputs
+            outputs = drop(outputs, dropout, jax.random.fold_in(rng, layer))
+    return outputs
 
 
-def _lstm(params: dict[str, Array], inputs: Array, mask: Array, *, reverse: bool) -> Array:
-    """Return the outputs `[B, T, H]` of one direction of one layer."""
-    recurrent_kernel = params["recurrent_kernel"]
-    batch, hidden = inputs.shape[0], recurrent_kernel.shape[0]
-    # All steps at once, outside the scan: one large product instead of T small ones.
-    projected = jnp.einsum("btf,fg->tbg", inputs, params["input_kernel"]) + params["bias"]
+def _input_gates(directions: dict[str, dict[str, Array]], inputs: Array) -> Array:
+    """Return the input products of a layer, forward then backward on the last axis.
 
-    def step(carry: tuple[Array, Array], step_inputs: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
-        cell, output = carry
-        gates, valid = step_inputs
-        i, f, g, o = jnp.split(gates + output @ recurrent_kernel, _GATES, axis=-1)
-        new_cell = jax.nn.sigmoid(f) * cell + jax.nn.sigmoid(i) * jnp.tanh(g)
-        new_output = jax.nn.sigmoid(o) * jnp.tanh(new_cell)
-        kept = valid[:, None]
-        carry = jnp.where(kept, new_cell, cell), jnp.where(kept, new_output, output)
-        return carry, jnp.where(kept, new_output, jnp.zeros_like(new_output))
+    For all steps at once, outside the scan: one large product instead of T small ones.
+    """
+    products = [
+        inputs @ directions[name]["input_kernel"] + directions[name]["bias"]
+        for name in ("forward", "backward")
+        if name in directions
+    ]
+    return jnp.concatenate(products, axis=-1)
 
-    zero = jnp.zeros((batch, hidden), projected.dtype)
-    _, outputs = jax.lax.scan(step, (zero, zero), (projected, mask.T), reverse=reverse)
+
+def _lstm(params: dict[str, Array], gates: Array, mask: Array, *, reverse: bool) -> Array:
+    """Return the outputs `[B, T, H]` of one direction of one layer, from its input products `[B, T, 4H]`."""
+    outputs = _recurrence(params["recurrent_kernel"], jnp.swapaxes(gates, 0, 1), mask.T, reverse)
     return jnp.swapaxes(outputs, 0, 1)
+
+
+class _Step(NamedTuple):
+    """What the backward pass needs of a step: the state before it, the gates, and tanh of the cell after it."""
+
+    cell: Array
+    output: Array
+    i: Array
+    f: Array
+    g: Array
+    o: Array
+    tanh: Array
+
+
+@functools.partial(jax.custom_vjp, nondiff_argnums=(3,))
+def _recurrence(recurrent_kernel: Array, gates: Array, mask: Array, reverse: bool) -> Array:
+    """Return the outputs `[T, B, H]` from input products `[T, B, 4H]` and a mask `[T, B]`.
+
+    Differentiated by hand: JAX would add up the gradient of the recurrent kernel `[H, 4H]` in every step of the scan;
+    here the steps' cotangents are kept, and it is one product after the loop.
+    """
+    return _recurrence_forward(recurrent_kernel, gates, mask, reverse)[0]
+
+
+def _recurrence_forward(
+    recurrent_kernel: Array, gates: Array, mask: Array, reverse: bool
+) -> tuple[Array, tuple[Array, Array, _Step]]:
+    def step(state: tuple[Array, Array], inputs: tuple[Array, Array]) -> tuple[tuple[Array, Array], Any]:
+        cell, output = state
+        gates, valid = inputs
+        i, f, g, o = jnp.split(gates + output @ recurrent_kernel, _GATES, axis=-1)
+        i, f, g, o = jax.nn.sigmoid(i), jax.nn.sigmoid(f), jnp.tanh(g), jax.nn.sigmoid(o)
+        new_cell = f * cell + i * g
+        tanh = jnp.tanh(new_cell)
+        new_output = o * tanh
+        kept = valid[:, None]
+        after = jnp.where(kept, new_cell, cell), jnp.where(kept, new_output, output)
+        return after, (jnp.where(kept, new_output, jnp.zeros_like(new_output)), _Step(cell, output, i, f, g, o, tanh))
+
+    zero = jnp.zeros((gates.shape[1], recurrent_kernel.shape[0]), gates.dtype)
+    _, (outputs, steps) = jax.lax.scan(step, (zero, zero), (gates, mask), reverse=reverse)
+    return outputs, (recurrent_kernel, mask, steps)
+
+
+def _recurrence_backward(
+    reverse: bool, saved: tuple[Array, Array, _Step], cotangents: Array
+) -> tuple[Array, Array, None]:
+    recurrent_kernel, mask, steps = saved
+
+    def step(cotangent: tuple[Array, Array], inputs: tuple[Array, Array, _Step]) -> tuple[tuple[Array, Array], Array]:
+        """Go from the cotangents of the state after a step to those of the state before it and of the gates."""
+        d_cell, d_output = cotangent
+        d_emitted, valid, (cell, _, i, f, g, o, tanh) = inputs
+        d_new_output = d_output + d_emitted
+        d_new_cell = d_cell + d_new_output * o * (1 - tanh**2)
+        parts = (
+            d_new_cell * g * i * (1 - i),
+            d_new_cell * cell * f * (1 - f),
+            d_new_cell * i * (1 - g**2),
+            d_new_output * tanh * o * (1 - o),
+        )
+        kept = valid[:, None]
+        d_gates = jnp.concatenate(parts, axis=-1)
+        d_gates = jnp.where(kept, d_gates, jnp.zeros_like(d_gates))
+        before = jnp.where(kept, d_new_cell * f, d_cell), jnp.where(kept, d_gates @ recurrent_kernel.T, d_output)
+        return before, d_gates
+
+    zero = jnp.zeros_like(steps.cell[0])
+    _, d_gates = jax.lax.scan(step, (zero, zero), (cotangents, mask, steps), reverse=not reverse)
+    return jnp.einsum("tbh,tbg->hg", steps.output, d_gates), d_gates, None
+
+
+_recurrence.defvjp(_recurrence_forward, _recurrence_backward)

@@ -7,6 +7,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from mdnvo_jax.model.convolution import Products, convolve
+from mdnvo_jax.model.dropout import drop
+
 
 class Layer(NamedTuple):
     """One convolution: a square kernel of `kernel` pixels, `stride`, and its output `channels` at full width."""
@@ -55,27 +58,6 @@ def map_size(height: int, width: int) -> tuple[int, int]:
     return height, width
 
 
-def convolve(x: Array, kernel: Array, stride: int, padding: int) -> Array:
-    """Return the cross-correlation of `x` with `kernel`: the one place where the model convolves.
-
-    Args:
-      x: maps `[N, H, W, C]`.
-      kernel: weights `[kernel, kernel, C, D]`.
-      stride: step in pixels, the same in both directions.
-      padding: zeros added on each of the four sides.
-
-    Returns:
-      `[N, (H + 2 * padding - kernel) // stride + 1, ..., D]`.
-    """
-    return jax.lax.conv_general_dilated(
-        x,
-        kernel,
-        window_strides=(stride, stride),
-        padding=((padding, padding), (padding, padding)),
-        dimension_numbers=("NHWC", "HWIO", "NHWC"),
-    )
-
-
 class Moments(NamedTuple):
     """Mean and biased variance by channel `[C]` over the `pixels` that were not masked."""
 
@@ -108,6 +90,7 @@ class ConvBlock(nn.Module):
     layer: Layer
     channels: int
     dropout: float
+    products: Products = "float32"
 
     @nn.compact
     def __call__(self, x: Array, mask: Array, *, train: bool) -> Array:
@@ -119,7 +102,7 @@ class ConvBlock(nn.Module):
         running_mean = self.variable("batch_stats", "mean", jnp.zeros, (self.channels,))
         running_variance = self.variable("batch_stats", "var", jnp.ones, (self.channels,))
 
-        x = convolve(x, kernel, self.layer.stride, self.layer.padding)
+        x = convolve(x, kernel, self.layer.stride, self.layer.padding, self.products)
         mean, variance = running_mean.value, running_variance.value
         if train:
             batch = batch_moments(x, mask)
@@ -131,7 +114,7 @@ class ConvBlock(nn.Module):
             variance = jnp.where(filled, batch.variance, variance)
         x = (x - mean) * (scale * jax.lax.rsqrt(variance + BATCH_NORM_EPSILON)) + bias
         x = nn.leaky_relu(x, LEAKY_SLOPE)
-        return nn.Dropout(self.dropout)(x, deterministic=not train)
+        return drop(x, self.dropout, self.make_rng("dropout")) if train and self.dropout else x
 
 
 def _blend(running: Array, batch: Array) -> Array:
@@ -144,6 +127,7 @@ class ConvStack(nn.Module):
 
     multiplier: float
     dropout: float
+    products: Products = "float32"
 
     @nn.compact
     def __call__(self, pairs: Array, mask: Array, *, train: bool) -> Array:
@@ -159,5 +143,6 @@ class ConvStack(nn.Module):
         """
         for layer in LAYERS:
             channels = layer_channels(layer, self.multiplier)
-            pairs = ConvBlock(layer, channels, self.dropout, name=layer.name)(pairs, mask, train=train)
+            block = ConvBlock(layer, channels, self.dropout, self.products, name=layer.name)
+            pairs = block(pairs, mask, train=train)
         return pairs

@@ -20,8 +20,7 @@ Variables = dict[str, Any]
 class Network(nn.Module):
     """The whole network, in float32. Parameters: `stack` (`conv.ConvStack`), `lstm` (`bilstm.init_lstm`), `head`.
 
-    Besides calling it on windows, prediction runs its two halves apart, so that a pair that lies in several windows
-    goes through the convolutions once: `method="pair_features"`, then `method="outputs_from_features"`.
+    It is what is trained; prediction runs the same function in parts, see `fold`.
     """
 
     image_config: ImageConfig
@@ -30,7 +29,7 @@ class Network(nn.Module):
     def setup(self) -> None:
         """Declare the three parts."""
         config = self.model_config
-        self.stack = ConvStack(config.width, config.conv_dropout)
+        self.stack = ConvStack(config.width, config.conv_dropout, config.products)
         self.lstm: LstmParams = self.param(
             "lstm",
             functools.partial(
@@ -59,35 +58,16 @@ class Network(nn.Module):
         batch, frames = images.shape[:2]
         if mask.shape != (batch, frames - 1):
             raise ValueError(f"images {images.shape} and mask {mask.shape}: expected a mask of {(batch, frames - 1)}")
-        self._check_frames(images)
+        expected = (self.image_config.height, self.image_config.width, self.image_config.channels)
+        if images.shape[2:] != expected:
+            raise ValueError(f"found frames of shape {images.shape[2:]}, expected {expected} as in the image config")
         normalised = normalise(images, self.image_config.normalisation)
         pairs = jnp.concatenate([normalised[:, :-1], normalised[:, 1:]], axis=-1)
         maps = self.stack(pairs.reshape(batch * (frames - 1), *pairs.shape[2:]), mask.reshape(-1), train=train)
-        return self._outputs(maps.reshape(batch, frames - 1, -1), mask, train=train)
-
-    def pair_features(self, first: Array, second: Array) -> Array:
-        """Return the features `[N, F]` of pairs of frames, each `[N, H, W, C]` uint8, as in evaluation."""
-        self._check_frames(first)
-        self._check_frames(second)
-        pairs = jnp.concatenate(
-            [normalise(frames, self.image_config.normalisation) for frames in (first, second)], axis=-1
-        )
-        count = pairs.shape[0]
-        return self.stack(pairs, jnp.ones(count, bool), train=False).reshape(count, -1)
-
-    def outputs_from_features(self, features: Array, mask: Array) -> Array:
-        """Return the raw outputs `[B, T, D]` of windows of features `[B, T, F]`, `mask` `[B, T]`, as in evaluation."""
-        return self._outputs(features, mask, train=False)
-
-    def _outputs(self, features: Array, mask: Array, *, train: bool) -> Array:
+        features = maps.reshape(batch, frames - 1, -1)
         dropout = self.model_config.lstm_dropout
         rng = self.make_rng("dropout") if train and dropout > 0 else None
         return self.head(bilstm(self.lstm, features, mask, dropout=dropout, rng=rng))
-
-    def _check_frames(self, images: Array) -> None:
-        expected = (self.image_config.height, self.image_config.width, self.image_config.channels)
-        if images.shape[-3:] != expected:
-            raise ValueError(f"found frames of shape {images.shape[-3:]}, expected {expected} as in the image config")
 
 
 def build(image_config: ImageConfig, model_config: ModelConfig) -> Network:
@@ -113,8 +93,6 @@ def initialise(network: Network, rng: Array, image_config: ImageConfig, steps: i
       steps: length of a window, at least 1; no shape depends on it.
     """
     init = functools.partial(_init, network, image_config, steps)
-    if isinstance(rng, jax.core.Tracer):
-        return init(rng)  # a part of the caller's own jit or eval_shape
     # One small program a kernel's shape, each run once: on a CPU, optimising them takes seconds and gains nothing.
     on_cpu = jax.default_backend() == "cpu"
     options: dict[str, str | bool] = {"xla_backend_optimization_level": "0"} if on_cpu else {}

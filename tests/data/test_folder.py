@@ -147,7 +147,7 @@ def film(path, code, count=20, noise=0):
 @pytest.mark.parametrize(("name", "code"), [("a.avi", "MJPG"), ("a.mp4", "mp4v")])
 def test_a_video_is_read_in_order_and_out_of_order(tmp_path, name, code):
     sequence = read_frames(film(tmp_path / name, code), 3)
-    assert sequence.count == 20
+    assert sequence.count == 20 and sequence.in_order
     np.testing.assert_allclose(sequence.timestamps, np.arange(20) / 12.5)
     assert "frame 7" in sequence.label(7)
     for index in [*range(20), 3, 4, 4, 15, 0, 19]:

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from jax.test_util import check_grads
 
 from mdnvo_jax.model.bilstm import bilstm, init_lstm
 
@@ -103,6 +104,18 @@ def test_agrees_with_torch(golden, assert_close, kind, wide, tolerance):
                 arrays["bias"] = arrays["bias"] / 2
                 for name, array in arrays.items():
                     assert_close(by_params[layer][direction][name], array, tolerance)
+
+
+@pytest.mark.parametrize("bidirectional", [True, False])
+def test_gradients_are_those_of_finite_differences(bidirectional):
+    """The backward pass is written by hand; holes, padding and an empty window included."""
+    mask = np.array([[1, 1, 1, 1, 1, 1], [1, 1, 0, 1, 0, 0], [0, 0, 0, 0, 0, 0]], bool)
+    with jax.enable_x64(True):
+        params = jax.tree.map(np.float64, random_params(layers=2, bidirectional=bidirectional))
+        inputs = np.random.default_rng(2).normal(size=(3, STEPS, FEATURES))
+        check_grads(
+            jax.jit(lambda params, inputs: bilstm(params, inputs, mask)), (params, inputs), 1, ["rev"], rtol=1e-6
+        )
 
 
 def test_padding_changes_nothing():

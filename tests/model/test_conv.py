@@ -5,7 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from mdnvo_jax.model.conv import LAYERS, ConvBlock, ConvStack, Layer, batch_moments, convolve, layer_channels, map_size
+from mdnvo_jax.model.conv import LAYERS, ConvBlock, ConvStack, Layer, batch_moments, layer_channels, map_size
+from mdnvo_jax.model.convolution import convolve
 from mdnvo_jax.model.flownet import load_stack, read_flownet, write_stack
 
 LAYER = Layer("conv", 3, 2, 4)

@@ -1,4 +1,3 @@
-import functools
 import subprocess
 import sys
 import zipfile
@@ -11,8 +10,10 @@ import pytest
 
 from mdnvo_jax.config import ImageConfig, ModelConfig
 from mdnvo_jax.errors import InputError
-from mdnvo_jax.model.conv import LAYERS, convolve
+from mdnvo_jax.model.conv import LAYERS
+from mdnvo_jax.model.convolution import convolve
 from mdnvo_jax.model.flownet import load_stack, read_flownet, write_stack
+from mdnvo_jax.model.fold import fold_stack, folded_stack
 from mdnvo_jax.model.network import build, template
 from mdnvo_jax.model.normalise import normalise
 
@@ -28,8 +29,10 @@ def zeros(image_config, width):
 
 
 def features(network, variables, first, second):
-    run = functools.partial(network.apply, method="pair_features")
-    return jax.jit(run, compiler_options={"xla_backend_optimization_level": 0})(variables, first, second)
+    frames = [normalise(frames, network.image_config.normalisation) for frames in (first, second)]
+    stack = fold_stack(variables["params"]["stack"], variables["batch_stats"]["stack"])
+    run = jax.jit(folded_stack, compiler_options={"xla_backend_optimization_level": 0})
+    return run(stack, jnp.concatenate(frames, -1))
 
 
 @pytest.mark.parametrize(

@@ -97,8 +97,7 @@ def test_initialisation_is_a_function_of_the_key(network, variables):
     jax.tree.map(np.testing.assert_array_equal, again, variables)
     other = initialise(network, jax.random.key(1), IMAGE, STEPS)
     assert (other["params"]["head"]["kernel"] != variables["params"]["head"]["kernel"]).any()
-    # Also as a part of somebody else's program.
-    shapes = jax.eval_shape(lambda key: initialise(network, key, IMAGE, STEPS), jax.random.key(0))
+    shapes = template(network, IMAGE, STEPS)
     assert jax.tree.map(jnp.shape, shapes) == jax.tree.map(jnp.shape, variables)
 
 
@@ -110,21 +109,6 @@ def test_colour_and_other_normalisations(images):
         assert shapes["params"]["stack"]["conv1"]["kernel"].shape == (7, 7, 6, 1)
         output = jax.eval_shape(network.apply, shapes, images.repeat(3, -1), ALL)
         assert output.shape == (BATCH, STEPS, 26)
-
-
-def test_the_halves_make_the_whole(network, variables, evaluate, images):
-    features = jit(functools.partial(network.apply, method="pair_features"))
-    outputs = jit(functools.partial(network.apply, method="outputs_from_features"))
-    pairs = images[:, :-1].reshape(-1, 33, 65, 1), images[:, 1:].reshape(-1, 33, 65, 1)
-    mask = np.array([[True] * 4, [True, False, True, False]])
-    whole = evaluate(images, mask)
-    halves = outputs(variables, features(variables, *pairs).reshape(BATCH, STEPS, -1), mask)
-    np.testing.assert_allclose(halves, whole, rtol=1e-4, atol=1e-5)
-    # The order of the two frames matters, and that of the pairs does not.
-    swapped = features(variables, *pairs[::-1])
-    assert np.abs(swapped - features(variables, *pairs)).max() > 0.01
-    backwards = features(variables, pairs[0][::-1], pairs[1][::-1])
-    np.testing.assert_allclose(backwards[::-1], features(variables, *pairs), rtol=1e-4, atol=1e-5)
 
 
 def test_valid_steps_know_nothing_of_masked_ones(evaluate, train, variables, images):

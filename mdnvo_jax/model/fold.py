@@ -1,0 +1,123 @@
+"""The network as prediction runs it: BatchNorm folded into the convolutions, each half a pure function of arrays.
+
+In evaluation a block of the stack is `leaky((conv(x, K) - mean) a + bias)` with `a = scale / sqrt(var + epsilon)`: a
+convolution with the kernel `K a` and the bias `bias - mean a`. Three passes over every map are spared.
+
+Of the LSTM, the product of the features with the first layer's kernels depends on one pair of frames alone. It is taken
+apart (`pair_gates`), so that a pair which lies in several windows goes through it once, as through the convolutions.
+"""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+
+from mdnvo_jax.config import ImageConfig, ModelConfig
+from mdnvo_jax.mixture import Mixture
+from mdnvo_jax.model.bilstm import LstmParams, bilstm_from_gates, input_gates
+from mdnvo_jax.model.conv import BATCH_NORM_EPSILON, LAYERS, LEAKY_SLOPE
+from mdnvo_jax.model.convolution import Products, convolve
+from mdnvo_jax.model.head import Labels, mixture_from_outputs
+from mdnvo_jax.model.normalise import normalise
+
+
+class FoldedLayer(NamedTuple):
+    """A convolution with a bias: kernel `[k, k, C, D]`, bias `[D]`."""
+
+    kernel: Array | np.ndarray
+    bias: Array | np.ndarray
+
+
+class Folded(NamedTuple):
+    """A trained network without what only training needs.
+
+    Attributes:
+      stack: the convolutions, one for each of `conv.LAYERS`.
+      lstm: parameters of `bilstm`.
+      head: kernel `[2H, D]` and bias `[D]` of the last dense layer.
+      labels: mean and standard deviation of the training steps, `[6]` each, in metres and radians.
+      residual_scale: see `head.mixture_from_outputs`, `[6]`.
+    """
+
+    stack: tuple[FoldedLayer, ...]
+    lstm: LstmParams
+    head: dict[str, Array]
+    labels: Labels
+    residual_scale: Array
+
+
+def fold_stack(params: Mapping[str, Any], batch_stats: Mapping[str, Any]) -> tuple[FoldedLayer, ...]:
+    """Return the stack with its BatchNorm folded, as float32 of numpy; computed in float64.
+
+    Args:
+      params: of the stack, by layer: kernel `[k, k, C, D]`, scale `[D]`, bias `[D]`.
+      batch_stats: of the stack, by layer: mean `[D]`, var `[D]`.
+    """
+    return tuple(_fold_layer(params[layer.name], batch_stats[layer.name]) for layer in LAYERS)
+
+
+def _fold_layer(params: Mapping[str, Any], batch_stats: Mapping[str, Any]) -> FoldedLayer:
+    kernel, scale, bias = (np.asarray(params[name], np.float64) for name in ("kernel", "scale", "bias"))
+    mean, variance = (np.asarray(batch_stats[name], np.float64) for name in ("mean", "var"))
+    factor = scale / np.sqrt(variance + BATCH_NORM_EPSILON)
+    return FoldedLayer((kernel * factor).astype(np.float32), (bias - mean * factor).astype(np.float32))
+
+
+def normalised_frames(frames: Array, image_config: ImageConfig) -> Array:
+    """Return frames `[..., H, W, C]` uint8 as the network reads them.
+
+    Raises:
+      ValueError: they are of another size than the configuration says, or see `normalise`.
+    """
+    expected = (image_config.height, image_config.width, image_config.channels)
+    if frames.shape[-3:] != expected:
+        raise ValueError(f"found frames of shape {frames.shape[-3:]}, expected {expected} as in the image config")
+    return normalise(frames, image_config.normalisation)
+
+
+def stacked_pairs(frames: Array, image_config: ImageConfig) -> Array:
+    """Return consecutive frames `[N+1, H, W, C]` uint8 as normalised pairs `[N, H, W, 2C]`."""
+    normalised = normalised_frames(frames, image_config)
+    return jnp.concatenate([normalised[:-1], normalised[1:]], axis=-1)
+
+
+def folded_stack(stack: Sequence[FoldedLayer], pairs: Array, products: Products = "float32") -> Array:
+    """Return the features `[N, F]` of normalised pairs `[N, H, W, 2C]`; for `products` see `convolution`."""
+    maps = pairs
+    for layer, (kernel, bias) in zip(LAYERS, stack, strict=True):
+        maps = convolve(maps, jnp.asarray(kernel), layer.stride, layer.padding, products) + bias
+        maps = jnp.maximum(maps, LEAKY_SLOPE * maps)
+    return maps.reshape(maps.shape[0], -1)
+
+
+def pair_features(model: Folded, frames: Array, image_config: ImageConfig, products: Products = "float32") -> Array:
+    """Return the features `[N, F]` of the pairs of consecutive frames `[N+1, H, W, C]` uint8."""
+    return folded_stack(model.stack, stacked_pairs(frames, image_config), products)
+
+
+def pair_gates(model: Folded, features: Array) -> Array:
+    """Return what features `[..., F]` add to the gates of the LSTM's first layer, `[..., G]`."""
+    return input_gates(model.lstm, features)
+
+
+def gates_size(model: Folded) -> int:
+    """Return the size G of what `pair_gates` gives."""
+    return sum(direction["bias"].shape[0] for direction in model.lstm["layer0"].values())
+
+
+def window_densities(
+    model: Folded, gates: Array, mask: Array, model_config: ModelConfig, sigma_scale: Array | None = None
+) -> Mixture:
+    """Return the density of every step of windows, in metres and radians.
+
+    Args:
+      model: of `fold_stack` and the rest of a training.
+      gates: of `pair_gates`, `[B, T, G]`.
+      mask: `[B, T]`, false for steps that do not count.
+      model_config: of the network.
+      sigma_scale: see `head.mixture_from_outputs`.
+    """
+    outputs = bilstm_from_gates(model.lstm, gates, mask) @ model.head["kernel"] + model.head["bias"]
+    return mixture_from_outputs(outputs, model.labels, model_config, model.residual_scale, sigma_scale)
