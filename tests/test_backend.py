@@ -1,5 +1,6 @@
 """The convolutions outside JAX, and in another precision: the same steps within what is promised."""
 
+import dataclasses
 import importlib.util
 import json
 import os
@@ -15,6 +16,7 @@ from small_model import CONFIG, FRAMES, save, trained
 
 from mdnvo_jax import backend, predictor
 from mdnvo_jax.errors import InputError
+from mdnvo_jax.model.fold import folded_stack
 from mdnvo_jax.predict import main
 
 openvino = pytest.mark.skipif(not importlib.util.find_spec("openvino"), reason="openvino is not installed")
@@ -50,6 +52,21 @@ def test_openvino_computes_the_same(model: predictor.Predictor, expected: np.nda
         assert np.abs((theirs.steps - ours.steps) / ours.sigma).max() < 5 * TOLERANCE[precision]
         assert np.abs(ours.steps - ours.steps[0]).max() > 0.05
         assert theirs.about["backend"] == "openvino"
+
+
+@openvino
+@pytest.mark.parametrize("precision", ["float32", "bfloat16"])
+def test_maps_of_many_pixels(model: predictor.Predictor, precision: str) -> None:
+    image = dataclasses.replace(CONFIG.image, height=70, width=150)
+    pairs = np.random.default_rng(0).normal(size=(2, 70, 150, 2)).astype(np.float32)
+    expected = np.asarray(folded_stack(model.model.stack, pairs))
+    assert expected.shape == (2, 2 * 3 * 64)
+    found = backend.openvino_compiled(model.model.stack, image, precision)(pairs)
+    error = np.abs(found - expected).max() / np.abs(expected).max()
+    assert error < TOLERANCE[precision]
+    able = backend._import_openvino().Core().get_property("CPU", "OPTIMIZATION_CAPABILITIES")
+    if precision == "bfloat16" and "BF16" in able:
+        assert error > 1e-3
 
 
 @openvino

@@ -19,9 +19,9 @@ def numbered(count, *, bad=(), in_order=False, seen=None, delay=0.0):
     """Frames whose pixels are their number; the later of two neighbours is read faster."""
 
     def read(index):
+        time.sleep(delay * (index % 2 == 0))
         if seen is not None:
             seen.append(index)
-        time.sleep(delay * (index % 2 == 0))
         if index in bad:
             raise InputError(f"frame {index} is bad")
         return np.full((4, 6, 1), index, np.uint8)
@@ -63,8 +63,11 @@ def test_reading_stays_a_little_ahead_and_stops_with_the_reader():
     # The five frames of the chunk, two chunks more, and what a thread is at.
     assert len(seen) <= 5 + 8 + 1
     found.close()
+    slow = chunks(numbered(100, seen=seen, delay=0.02), 4)
+    next(slow)
+    slow.close()
     count = len(seen)
-    time.sleep(0.02)
+    time.sleep(0.1)
     assert len(seen) == count
     assert not [thread for thread in threading.enumerate() if thread.name.startswith("frames")]
 
