@@ -1,6 +1,6 @@
 """MDN-VO on KITTI, to the letter of the paper where it speaks (its sections IV-A and IV-B).
 
-    bin/convert_flownet flownets_bn_EPE2.459.pth.tar --output flownet.npz
+    bin/convert_flownet flownets_bn_EPE2.459.pth.tar flownet.npz
     bin/prepare_kitti --root KITTI --output CACHE --config configs/mdn_vo_kitti.py
     python -m mdnvo_jax.train configs/mdn_vo_kitti.py --workdir runs/mdn_vo --data.root KITTI --data.cache CACHE \
         --training.initial_stack flownet.npz

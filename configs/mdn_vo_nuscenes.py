@@ -1,6 +1,6 @@
 """MDN-VO on nuScenes ("Experiments on the nuScenes Dataset", Table II and the last two figures of the paper).
 
-    bin/convert_flownet flownets_bn_EPE2.459.pth.tar --output flownet.npz
+    bin/convert_flownet flownets_bn_EPE2.459.pth.tar flownet.npz
     python -m mdnvo_jax.train configs/mdn_vo_nuscenes.py --workdir runs/mdn_vo_nuscenes --data.root NUSCENES \
         --training.initial_stack flownet.npz
 
