@@ -17,7 +17,8 @@ import numpy as np
 from mdnvo_jax import geometry
 from mdnvo_jax.data.sequence import Camera, Sequence
 from mdnvo_jax.data.world import film, render, world
-from mdnvo_jax.data.world.motion import FRAME_S
+from mdnvo_jax.data.world.motion import CAMERA_HEIGHT_M, FRAME_S
+from mdnvo_jax.data.world.style import stream
 from mdnvo_jax.errors import InputError
 
 # Intrinsics and size of KITTI's left grey camera, sequence 00.
@@ -53,6 +54,18 @@ def kitti_camera(height: int, width: int) -> Camera:
     return _KITTI_CAMERA[0] * scale, _KITTI_CAMERA[1] * scale, (_KITTI_CAMERA[2] + 0.5) * scale - 0.5, cy
 
 
+def varied_camera(seed: int, height: int, width: int) -> Camera:
+    """Return a camera of another make for the world of `seed`: for training that meets more than KITTI's.
+
+    The focal length is 0.7 to 1.4 of KITTI's, 102 to 63 degrees across, and the principal point lies up to 3 % of the
+    width and 8 % of the height off KITTI's.
+    """
+    fx, fy, cx, cy = kitti_camera(height, width)
+    focal, right, down = stream(seed, "camera").uniform(-1, 1, 3)
+    scale = float(np.exp(np.log(1.4) * focal))
+    return fx * scale, fy * scale, cx + 0.03 * width * float(right), cy + 0.08 * height * float(down)
+
+
 def drive(
     seed: int,
     frames: int,
@@ -63,6 +76,7 @@ def drive(
     camera: Camera | None = None,
     samples: int = 2,
     effects: float = 1.0,
+    camera_height_m: tuple[float, float] = CAMERA_HEIGHT_M,
 ) -> Sequence:
     """Return a drive through the world of `seed`, its frames rendered when they are read.
 
@@ -74,7 +88,10 @@ def drive(
       channels: 1 for grey, 3 for RGB.
       camera: fx, fy, cx, cy in pixels; KITTI's, scaled to the frame, where None.
       samples: rays a pixel, 1, 2 or 4: more is smoother and slower.
-      effects: strength of blur, noise, vignetting and drifting exposure; 0 leaves them out.
+      effects: strength of what cameras and weather do to frames: blur, noise, vignetting, jumps of exposure, glare,
+        rain on the glass, JPEG; 0 leaves them out.
+      camera_height_m: range from which the world draws the height of its camera above the road, 0.3 to 5 m. Widen it
+        to (1.2, 2.2) for cameras in other vehicles: the same motion then looks slower the higher the camera is.
 
     Returns:
       A sequence with poses (the first is the identity), timestamps and camera; `read` may be called by many threads.
@@ -82,14 +99,14 @@ def drive(
     Raises:
       InputError: an argument is out of range.
     """
-    camera = _checked(seed, frames, height, width, camera)
+    camera = _checked(seed, frames, height, width, camera, camera_height_m)
     if channels not in (1, 3):
         raise InputError(f"channels {channels} of a synthetic drive: expected 1 for grey or 3 for RGB")
     if samples not in (1, 2, 4):
         raise InputError(f"samples {samples} a pixel of a synthetic drive: expected 1, 2 or 4")
     if not 0 <= effects <= 10:
         raise InputError(f"effects {effects} of a synthetic drive: expected 0 to 10, where 1 is ordinary")
-    style, _, poses = world.path(seed, frames)
+    style, _, poses = world.path(seed, frames, camera_height_m)
     rows = film.films(style, effects, FRAME_S * np.arange(frames))
     poses = geometry.inverse(poses[0]) @ poses
     # Not only to rounding.
@@ -107,7 +124,7 @@ def drive(
                 return kept[index]
         # Outside the lock: two threads that want the same frame at once render the same bits twice.
         shown = render.render(
-            world.frame_at(_world(seed, frames), index, channels),
+            world.frame_at(_world(seed, frames, camera_height_m), index, channels),
             look(),
             film.Film(*map(world.single, rows[index])),
             world.single(camera),
@@ -116,7 +133,7 @@ def drive(
             width=width,
             samples=samples,
         )
-        frame = np.asarray(shown)
+        frame = _through_jpeg(np.asarray(shown), int(film.Film(*rows[index]).quality))
         with lock:
             kept[index] = frame
             while len(kept) > _KEPT_FRAMES:
@@ -133,7 +150,16 @@ def drive(
     )
 
 
-def truth(seed: int, frames: int, index: int, *, height: int, width: int, camera: Camera | None = None) -> Truth:
+def truth(
+    seed: int,
+    frames: int,
+    index: int,
+    *,
+    height: int,
+    width: int,
+    camera: Camera | None = None,
+    camera_height_m: tuple[float, float] = CAMERA_HEIGHT_M,
+) -> Truth:
     """Return exact depth and flow of frame `index` of `drive(seed, frames, ...)`; see there for the arguments.
 
     The point that a pixel's centre u sees, moved along with its thing, is seen at u + flow one frame later, whether or
@@ -142,11 +168,11 @@ def truth(seed: int, frames: int, index: int, *, height: int, width: int, camera
     Raises:
       InputError: an argument is out of range.
     """
-    camera = _checked(seed, frames, height, width, camera)
+    camera = _checked(seed, frames, height, width, camera, camera_height_m)
     if not 0 <= index < frames:
         raise InputError(f"frame {index} of a drive of {frames} frames: expected 0 to {frames - 1}")
     # One frame more than the drive has, for the motion of the last one.
-    whole = _world(seed, frames + 1)
+    whole = _world(seed, frames + 1, camera_height_m)
     depth, flow, moving = render.geometry(
         world.frame_at(whole, index, 1),
         world.moved_at(whole, index),
@@ -173,7 +199,20 @@ def optical_flow(
 _world = functools.lru_cache(maxsize=_KEPT_WORLDS)(world.build_world)
 
 
-def _checked(seed: int, frames: int, height: int, width: int, camera: Camera | None) -> Camera:
+def _through_jpeg(frame: np.ndarray, quality: int) -> np.ndarray:
+    """Return `frame`, `[H, W, C]`, as it comes back from a JPEG file of this quality; itself for 0."""
+    if quality == 0:
+        return frame
+    import cv2
+
+    kind = cv2.IMREAD_GRAYSCALE if frame.shape[-1] == 1 else cv2.IMREAD_COLOR
+    stored = cv2.imencode(".jpg", np.ascontiguousarray(frame[..., ::-1]), [cv2.IMWRITE_JPEG_QUALITY, quality])[1]
+    return np.asarray(cv2.imdecode(stored, kind)).reshape(frame.shape)[..., ::-1].copy()
+
+
+def _checked(
+    seed: int, frames: int, height: int, width: int, camera: Camera | None, camera_height_m: tuple[float, float]
+) -> Camera:
     """Return the camera of a drive, after a look at what else it is made of."""
     if seed < 0:
         raise InputError(f"seed {seed} of a synthetic drive: expected 0 or more")
@@ -181,6 +220,9 @@ def _checked(seed: int, frames: int, height: int, width: int, camera: Camera | N
         raise InputError(f"{frames} frames of a synthetic drive: expected 1 or more")
     if min(height, width) < 8:
         raise InputError(f"synthetic frames of {width}x{height}: expected 8 or more rows and columns")
+    low, high = camera_height_m
+    if not 0.3 <= low <= high <= 5:
+        raise InputError(f"camera_height_m {low} to {high} of a synthetic drive: expected a range within 0.3 to 5 m")
     if camera is None:
         return kitti_camera(height, width)
     if len(camera) != 4 or not all(math.isfinite(value) for value in camera) or min(camera[:2]) <= 0:

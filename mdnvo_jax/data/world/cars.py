@@ -7,7 +7,7 @@ import numpy as np
 from mdnvo_jax.data.world.motion import ego_lane_m, road_coordinate
 from mdnvo_jax.data.world.road import BEHIND_M, NODE_M, Road
 from mdnvo_jax.data.world.style import Style, stream
-from mdnvo_jax.data.world.things import Paint, Things, join, make, paint, select, tint
+from mdnvo_jax.data.world.things import BALL, BOX, Paint, Things, join, make, paint, select, tint
 
 _COLOURS = np.array([(0.7, 0.7, 0.7), (0.4, 0.41, 0.43), (0.025, 0.025, 0.03), (0.12, 0.12, 0.13), (0.3, 0.03, 0.03),
                      (0.04, 0.07, 0.2)])  # fmt: skip
@@ -16,11 +16,16 @@ _NEAR_M = 320.0
 
 
 class Part(NamedTuple):
-    """A box of each car: half sizes `[n, 3]`, place ahead of the middle and height of the underside `[n]`, m; paint."""
+    """A part of each car: half sizes `[n, 3]`, place ahead of the middle and height of the underside `[n]`, m.
+
+    Attributes:
+      shape: `BOX` or `BALL`, `[n]`. paint: how it looks.
+    """
 
     half: np.ndarray
     ahead_m: np.ndarray
     bottom_m: np.ndarray
+    shape: np.ndarray
     paint: Paint
 
 
@@ -44,25 +49,40 @@ def car_parts(draw: np.ndarray) -> tuple[Part, ...]:
     colour, zero = tint(draw[:, 0:2], _COLOURS), np.zeros(len(draw))
     big, scale = draw[:, 2] < 0.1, 0.92 + 0.16 * draw[:, 3]
     body = np.stack([0.88 * scale + 0.2 * big, 0.36 * scale + 0.75 * big, 2.1 * scale + 0.8 * big], 1)
-    cabin = np.stack([0.74 * scale, 0.27 * scale, 1.2 * scale], 1)
+    # The greenhouse of a car is the upper half of an ellipsoid of glass, its roof of the car's colour; a van hides it.
+    cabin = np.stack([0.78 * scale, 0.58 * scale, 1.55 * scale], 1)
+    lights = body * np.array([0.92, 0.0, 1.0]) + np.array([0.0, 0.07, 0.015])
     # Panes low on the body pass for wheels.
     shell = paint(
-        colour, window=0.015, panes=(1.0, 1.0, 2.0), width=0.32, height=0.42, lift=-0.3, top=1.2, contrast=0.03,
+        colour, window=0.015, panes=(0.0, 1.0, 2.0), width=0.32, height=0.42, lift=-0.3, top=1.2, contrast=0.03,
         grain_m=0.8,
     )  # fmt: skip
-    glass = paint(
-        colour, window=0.02 + 0.06 * draw[:, 4], panes=(1.0, 1.0, 2.0), width=0.86, height=0.7, lift=-0.08, top=1.2,
-        contrast=0.03, grain_m=0.8,
-    )  # fmt: skip
-    bottom = np.full(len(draw), 0.2)
+    pane = 0.02 + 0.06 * draw[:, 4]
+    roof = np.clip(colour.mean(1) / pane, 0.5, 12)
+    glass = paint(np.tile(pane[:, None], 3), top=roof, contrast=0.2, grain_m=0.8)
+    lamps = paint(colour, window=0.45, panes=(2.0, 1.0, 0.0), width=0.35, height=1.0, contrast=0.03, glow=1.0)
+    bottom, box, ball = np.full(len(draw), 0.2), np.full(len(draw), BOX), np.full(len(draw), BALL)
     back = np.where(big, 0.9, -0.25) * scale
-    return Part(body, zero, bottom, shell), Part(cabin, back, bottom + 2 * body[:, 1] - 0.02, glass)
+    return (
+        Part(body, zero, bottom, box, shell),
+        Part(cabin, back, bottom + 2 * body[:, 1] - cabin[:, 1] * np.where(big, 2.2, 1), ball, glass),
+        Part(lights, zero, bottom + 0.43 * scale, box, lamps),
+    )
 
 
 def park(road: Road, s: np.ndarray, d: np.ndarray, yaw: np.ndarray, parts: tuple[Part, ...]) -> list[Things]:
     """Return cars that stand at `s`, `d` with a heading of `yaw` against the road."""
     return [
-        make(road, s + part.ahead_m * np.cos(yaw), d, part.half, part.paint, bottom_m=part.bottom_m, yaw=yaw)
+        make(
+            road,
+            s + part.ahead_m * np.cos(yaw),
+            d,
+            part.half,
+            part.paint,
+            bottom_m=part.bottom_m,
+            shape=part.shape,
+            yaw=yaw,
+        )
         for part in parts
     ]
 

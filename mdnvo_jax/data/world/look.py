@@ -26,6 +26,7 @@ class Look(NamedTuple):
     clouds: Array
     haze_m: Array
     half_width_m: Array
+    side: Array
     lane_m: Array
     lanes: Array
     sidewalk_m: Array
@@ -40,6 +41,13 @@ class Look(NamedTuple):
     patches: Array
     zebra: Array
     backdrop_rad: Array
+    daylight: Array
+    headlight: Array
+    lamps: Array
+    stone_m: Array
+    arrows: Array
+    wet: Array
+    rain: Array
 
 
 class View(NamedTuple):

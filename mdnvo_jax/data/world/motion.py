@@ -15,6 +15,12 @@ _PITCH_HZ = (0.7, 2.0)
 _ROLL_HZ = (0.2, 1.5)
 _HEAVE_HZ = (0.9, 1.8)
 _SINES = 7
+# Where the camera of a car may sit above the road, m: about KITTI's 1.65.
+CAMERA_HEIGHT_M = (1.55, 1.75)
+# Bumps: drain covers, seams, speed humps. The body rings at its resonance, Hz, and calms down within so many seconds.
+_BUMP_PITCH_M = 35.0
+_RING_HZ = 1.4
+_RING_S = 0.45
 
 
 class Mount(NamedTuple):
@@ -27,13 +33,13 @@ class Mount(NamedTuple):
     roll_rad: float
 
 
-def draw_mount(seed: int) -> Mount:
-    """Return the camera mount of a world: KITTI's height of 1.65 m and slightly lowered view, varied."""
+def draw_mount(seed: int, height_m: tuple[float, float] = CAMERA_HEIGHT_M) -> Mount:
+    """Return the camera mount of a world: a height from the range `height_m`, KITTI's slightly lowered view, varied."""
     rng = stream(seed, "mount")
     return Mount(
         ahead_m=rng.uniform(0.3, 1.6),
-        height_m=1.65 + np.clip(rng.normal(0, 0.06), -0.15, 0.15),
-        pitch_rad=np.deg2rad(np.clip(rng.normal(-0.6, 1.2), -3.6, 2.4)),
+        height_m=rng.uniform(*height_m),
+        pitch_rad=np.deg2rad(np.clip(rng.normal(-0.6, 1.4), -4.2, 3.0)),
         yaw_rad=np.deg2rad(rng.normal(0, 0.6)),
         roll_rad=np.deg2rad(rng.normal(0, 0.5)),
     )
@@ -62,8 +68,11 @@ def road_coordinate(road: Road, time: np.ndarray) -> np.ndarray:
     return -BEHIND_M + NODE_M * node + np.minimum(travelled, NODE_M)
 
 
-def camera_poses(style: Style, road: Road, frames: int) -> np.ndarray:
-    """Return `T_world_camera` of every frame, `[frames, 4, 4]`, in the world's axes, float64."""
+def camera_poses(style: Style, road: Road, frames: int, mount: Mount | None = None) -> np.ndarray:
+    """Return `T_world_camera` of every frame, `[frames, 4, 4]`, in the world's axes, float64.
+
+    The camera sits on `mount`, or where None on that of the world.
+    """
     # Frames on either side, so that the smoothed acceleration does not depend on where the drive is cut.
     margin = 8
     time = FRAME_S * np.arange(-margin, frames + margin)
@@ -86,6 +95,8 @@ def camera_poses(style: Style, road: Road, frames: int) -> np.ndarray:
     # A braking car noses down, a cornering one leans out: about 0.3 and 0.4 degrees for a m/s^2.
     bounce_pitch = bounce_pitch - softness * np.deg2rad(0.3) * braking
     bounce_roll = bounce_roll - softness * np.deg2rad(0.4) * bend * speed**2
+    bump_pitch, bump_heave = _bumps(style, s, speed)
+    bounce_pitch, heave = bounce_pitch + bump_pitch, heave + bump_heave
     if style.reversing:
         # The car looks the other way and keeps to the place where it would be: it rolls back along the road.
         yaw = yaw + np.pi
@@ -93,7 +104,7 @@ def camera_poses(style: Style, road: Road, frames: int) -> np.ndarray:
     pitch = np.arctan(slope_x * np.sin(yaw) + slope_z * np.cos(yaw)) + bounce_pitch
     roll = -np.arctan(slope_x * np.cos(yaw) - slope_z * np.sin(yaw)) + bounce_roll
     body = turn(yaw, 1) @ turn(pitch, 0) @ turn(roll, 2)
-    mount = draw_mount(style.seed)
+    mount = draw_mount(style.seed) if mount is None else mount
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, :3, :3] = body @ turn(mount.yaw_rad, 1) @ turn(mount.pitch_rad, 0) @ turn(mount.roll_rad, 2)
     axle = np.stack([x, -height - heave, z], axis=1)
@@ -126,6 +137,24 @@ def _wander(style: Style, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     angle = 2 * np.pi * s[:, None] / wavelength + phase
     d = ego_lane_m(style) + rng.normal(0, 0.2) + (amplitude * np.sin(angle)).sum(1)
     return d, (amplitude * 2 * np.pi / wavelength * np.cos(angle)).sum(1)
+
+
+def _bumps(style: Style, s: np.ndarray, speed: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (pitch rad, heave m) that bumps in the road excite: a damped ringing since the car went over each.
+
+    The time since then is taken from the distance at the speed of now.
+    """
+    rng = stream(style.seed, "bumps")
+    strength, first = rng.uniform(0, 1) ** 2, -BEHIND_M
+    count = int((s[-1] - first) / _BUMP_PITCH_M) + 2
+    draw = stream(style.seed, "bump places").random((count, 3))
+    place = first + _BUMP_PITCH_M * (np.arange(count) + draw[:, 0])
+    since = np.clip((s[:, None] - place) / np.maximum(speed, 0.5)[:, None], 0, 10 * _RING_S)
+    ring = (np.sin(2 * np.pi * _RING_HZ * since) * np.exp(-since / _RING_S) * draw[:, 1] ** 3 * (draw[:, 2] < 0.6)).sum(
+        1
+    )
+    ring = ring * strength * np.minimum(np.abs(speed) / 6, 1)
+    return np.deg2rad(1.0) * ring, -0.03 * ring
 
 
 def _sway(rng: np.random.Generator, time: np.ndarray, band_hz: tuple[float, float]) -> np.ndarray:

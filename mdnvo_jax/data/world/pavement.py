@@ -23,20 +23,23 @@ class Lane(NamedTuple):
       corner: of the map of cells, `[2]`, m. Cells keep their places in the world as the eye moves.
       side: side roads as rows (x, z, direction x, z, half width, reach left, reach right), `[k, 7]`.
       eye: the eye in the world, for textures, `[3]`.
+      lamps: heads of the nearest street lamps, `[k, 3]`.
     """
 
     nodes: Array
     corner: Array
     side: Array
     eye: Array
+    lamps: Array
 
 
 class Floor(NamedTuple):
-    """What the ground is made of: colour, contrast of its texture, share and brightness of paint on it."""
+    """What the ground is made of: colour, contrast of its texture, share of paint on it, how it shines, 0 to 1."""
 
     colour: Colour
     contrast: Array
     painted: Array
+    shine: Array
 
 
 def road_coordinates(x: Array, z: Array, lane: Lane) -> tuple[Array, Array, Array]:
@@ -103,10 +106,13 @@ def pave(point: Vector, view: View, stretched_m: Array, noise: Array, lane: Lane
     for c in range(look.colours.shape[1]):
         asphalt_c, verge_c, walk_c = look.colours[0, c], look.colours[1, c], look.colours[2, c]
         beside = mix(verge_c, walk_c * (1 - 0.5 * joints), walk)
-        colour.append(mix(mix(beside, 1.15 * walk_c + 0.06, kerb), asphalt_c * wear, asphalt))
+        dry = mix(mix(beside, 1.15 * walk_c + 0.06, kerb), asphalt_c * wear, asphalt)
+        colour.append(dry * (1 - 0.5 * look.wet))
     painted = _markings(s, d, along, across, look) * main * (1 - side)
     fresh = jnp.clip(1 - look.wear * (0.35 + 0.8 * noise), 0, 1)
-    return Floor(tuple(colour), mix(0.45, look.roughness, asphalt) - 0.25 * walk, painted * fresh)
+    # Water stands in ruts and hollows.
+    shine = look.wet * jnp.maximum(asphalt, walk) * jnp.clip(0.6 + 0.8 * (1 - wear) - 0.5 * noise, 0, 1)
+    return Floor(tuple(colour), mix(0.6, look.roughness, asphalt) - 0.35 * walk, painted * fresh, shine)
 
 
 def _side_roads(point: Vector, lane: Lane, footprint: Array) -> Array:
@@ -135,7 +141,18 @@ def _asphalt(world: Vector, s: Array, d: Array, along: Array, across: Array, str
     ridge += 0.5 * value_noise((world[0] / 0.4, world[2] / 0.4), look.seed + 15)
     where = value_noise((world[0] / 6, world[2] / 6), look.seed + 16)
     crack = band(ridge, -0.03, 0.03, 1.5 * stretched_m) * (where > 1 - 1.6 * look.cracks)
-    return factor * (1 - 0.65 * crack)
+    stones = lax.cond(look.stone_m > 0, _stones, lambda s, *_: jnp.ones_like(s), s, d, along, across, look)
+    return factor * (1 - 0.65 * crack) * stones
+
+
+def _stones(s: Array, d: Array, along: Array, across: Array, look: Look) -> Array:
+    """Return a factor on the colour of a road of stones: rows across the road, each shifted by half a stone."""
+    row = jnp.floor(s / look.stone_m)
+    place = d / look.stone_m + 0.5 * row
+    along, across = along / look.stone_m, across / look.stone_m
+    joint = jnp.maximum(pulses(s / look.stone_m + 0.5, 0.14, along), pulses(place + 0.5, 0.14, across))
+    tone = hashed((row.astype(jnp.int32), jnp.floor(place).astype(jnp.int32)), look.seed + 18)
+    return (1 + 0.35 * tone * visible(jnp.maximum(along, across))) * (1 - 0.6 * joint)
 
 
 def _markings(s: Array, d: Array, along: Array, across: Array, look: Look) -> Array:
@@ -152,4 +169,16 @@ def _markings(s: Array, d: Array, along: Array, across: Array, look: Look) -> Ar
     crossing = jnp.floor(s / 60.0)
     there = hashed((crossing.astype(jnp.int32),), look.seed + 17) > 1 - 2 * look.zebra
     bars = band(s - 60 * crossing, 28.0, 31.5, along) * pulses(d, 0.5, across) * there
-    return jnp.maximum(jnp.maximum(centre, lines), jnp.maximum(edges, bars))
+    return jnp.maximum(jnp.maximum(centre, lines), jnp.maximum(jnp.maximum(edges, bars), _arrows(s, d, across, look)))
+
+
+def _arrows(s: Array, d: Array, across: Array, look: Look) -> Array:
+    """Return the share that arrows cover: a stem of 3 m and a head of 2 m in the middle of a lane, the way it goes."""
+    lane = jnp.floor(d / look.lane_m)
+    onwards = jnp.where(d * look.side > 0, s, -s)
+    block = jnp.floor(onwards / 40)
+    ahead, aside = onwards - 40 * block - 20, jnp.abs(d - (lane + 0.5) * look.lane_m)
+    there = hashed((block.astype(jnp.int32), lane.astype(jnp.int32)), look.seed + 19) > 1 - 2 * look.arrows
+    half = jnp.where(ahead < 3, 0.08, 0.45 * (1 - (ahead - 3) / 2))
+    on_it = there & (jnp.abs(d) < look.lane_m * look.lanes) & (ahead > 0) & (ahead < 5)
+    return jnp.where(on_it, band(aside, -half, half, across), 0)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jax import Array, lax
 
-from mdnvo_jax.data.world import shade, trace
+from mdnvo_jax.data.world import lens, shade, trace
 from mdnvo_jax.data.world.film import Film, develop
 from mdnvo_jax.data.world.look import Colour, Look
 from mdnvo_jax.data.world.texture import Vector
@@ -35,7 +35,8 @@ def render(
     size = {"height": height, "width": width, "samples": samples}
     rays, hit = _cast(frame, camera, **size)
     shadows = _shadow(frame, hit, look, camera, **size)
-    return _develop(_shade(frame, rays, hit, shadows, look, camera, **size), film, index, **size)
+    light = _shade(frame, rays, hit, shadows, look, camera, **size)
+    return _develop(frame, light, hit.depth, look, film, camera, index, **size)
 
 
 _stage = partial(jax.jit, static_argnames=("height", "width", "samples"))
@@ -71,7 +72,7 @@ def _shade(
     def band(part: tuple[Vector, Hit, tuple[Array, Array]]) -> Colour:
         rays, hit, shadows = part
         view = shade.look_along(rays, hit.depth, camera[0], samples)
-        return shade.radiance(hit, view, frame.shapes, frame.paint, frame.lane, look, shadows)
+        return shade.radiance(hit, view, frame.shapes, frame.paint, frame.lane, look, shadows, frame.rotation)
 
     # Row by row of tiles: what is in work then fits the processor's cache.
     parts = jax.tree.map(lambda x: x.reshape(_rows(height), -1, x.shape[-1]), (rays, hit, shadows))
@@ -83,8 +84,25 @@ def _rows(height: int) -> int:
 
 
 @_stage
-def _develop(light: Colour, film: Film, index: int, *, height: int, width: int, samples: int) -> Array:
-    return develop(jnp.stack([trace.image(c, height, width, samples) for c in light], -1), film, jnp.int32(index))
+def _develop(
+    frame: Frame,
+    light: Colour,
+    depth: Array,
+    look: Look,
+    film: Film,
+    camera: Array,
+    index: int,
+    *,
+    height: int,
+    width: int,
+    samples: int,
+) -> Array:
+    size, index_ = (height, width, samples), jnp.int32(index)
+    picture = jnp.stack([trace.image(c, *size) for c in light], -1)
+    picture = lens.smear(picture, trace.image(1 / depth, *size), frame.motion, camera, film.shutter)
+    picture = lens.glare(picture, look.sun, frame.rotation, camera, film.glare * look.sun_strength)
+    picture = lens.rain(picture, film.rain, index_, look.seed)
+    return develop(picture, film, index_)
 
 
 @partial(jax.jit, static_argnames=("height", "width"))

@@ -20,7 +20,7 @@ AHEAD_M = 720.0
 TOP_SPEED_MPS = 30.0
 # What passengers and tyres bear: lateral acceleration, m/s^2, and yaw rate, rad/s; and the tightest bend, 1/m.
 LATERAL_MPS2 = 4.0
-YAW_RATE_RADPS = 0.55
+YAW_RATE_RADPS = 0.7
 _TIGHTEST_PER_M = 1 / 7.5
 # Share of those limits that the road uses: smoothing the curvature and wandering in the lane take the rest.
 _MARGIN = 0.95

@@ -6,7 +6,7 @@ Each kind is drawn from a stream of its own into places at a fixed pitch along t
 import numpy as np
 
 from mdnvo_jax.data.world.cars import car_parts, park
-from mdnvo_jax.data.world.road import BEHIND_M, NODE_M, Road
+from mdnvo_jax.data.world.road import BEHIND_M, NODE_M, Road, ground, place
 from mdnvo_jax.data.world.style import Style, stream
 from mdnvo_jax.data.world.things import BALL, CYLINDER, Things, fits, join, make, ordered, paint, select, slots, tint
 
@@ -14,6 +14,8 @@ _WALLS = np.array([(0.6, 0.58, 0.53), (0.45, 0.4, 0.33), (0.75, 0.74, 0.7), (0.3
 _ROOFS = np.array([(0.22, 0.09, 0.06), (0.1, 0.1, 0.1), (0.18, 0.15, 0.13)])
 _LEAVES = np.array([(0.05, 0.09, 0.025), (0.09, 0.13, 0.04), (0.03, 0.06, 0.025), (0.12, 0.12, 0.05)])
 _BARK = np.array([0.07, 0.06, 0.045])
+# From a lamp post to the middle of its arm, m.
+_ARM_M = 0.7
 _STEEL = np.array([0.28, 0.29, 0.3])
 
 
@@ -49,6 +51,7 @@ def _buildings(style: Style, road: Road) -> list[Things]:
         top=0.4,
         contrast=0.04 + 0.12 * draw[:, 10],
         grain_m=1.5,
+        glow=0.03,
     )
     # Cellars: the walls go on below the ground.
     parts = [make(road, s, d, half, walls)]
@@ -112,7 +115,7 @@ def _trees(style: Style, road: Road) -> list[Things]:
         rise = clear + (height - clear) * (0.8 * level + 0.2 * offset[:, 3])
         high = size * np.where(conifer, 0.9, 0.8)
         green = tint(draw[:, 8:10], _LEAVES) * (0.6 + 0.8 * offset[:, 2:3])
-        leaves = paint(green, contrast=0.8, grain_m=0.5, leafy=1.0)
+        leaves = paint(green, contrast=1.1, grain_m=0.8, leafy=1.0)
         at_s, at_d = s + radius * out * np.sin(angle), d + radius * out * np.cos(angle)
         half = np.stack([size, high, size], 1)
         parts.append(make(road, at_s, at_d, half, leaves, bottom_m=rise - high, shape=BALL, yaw=angle))
@@ -128,7 +131,7 @@ def _woods(style: Style, road: Road) -> list[Things]:
     d = side * (style.half_width_m + away + half[:, 0] + 8 * draw[:, 4])
     keep = (patch < style.trees * (1 - 0.6 * style.built)) & fits(style, road, s, d, half.max(1))
     s, d, side, half, draw = s[keep], d[keep], side[keep], half[keep], draw[keep]
-    leaves = paint(tint(draw[:, 5:7], _LEAVES) * 0.8, contrast=0.8, grain_m=0.9, leafy=1.0)
+    leaves = paint(tint(draw[:, 5:7], _LEAVES) * 0.8, contrast=1.1, grain_m=1.2, leafy=1.0)
     higher = half * np.array([0.75, 0.6, 0.75])
     at = s + 2.5 * (draw[:, 2] - 0.5), d + side * 1.5 * draw[:, 3]
     return [
@@ -148,21 +151,35 @@ def _bushes(style: Style, road: Road) -> list[Things]:
     return [make(road, s, d, half, leaves, bottom_m=-0.4 * half[:, 1], shape=BALL)]
 
 
-def _posts(style: Style, road: Road) -> list[Things]:
-    """Return lamp posts with their arms, sign posts with their plates, and delineators."""
-    rng = stream(style.seed, "post kinds")
+def _lamps(style: Style, road: Road) -> tuple[np.ndarray, np.ndarray, np.ndarray, float]:
+    """Return (s, d, side, height) of the street lamps."""
+    rng = stream(style.seed, "lamp kinds")
     pitch, high, gap = rng.uniform(20, 45), rng.uniform(5, 9), rng.uniform(0.3, 1.5)
-    lamps_there = rng.random() < style.poles
+    there = rng.random() < style.poles or style.lamps > 0
     s, side, draw = slots(style, road, "lamps", pitch, 2, jitter=0.1)
     d = side * (style.half_width_m + gap)
-    keep = (draw[:, 0] < 0.9 * lamps_there) & fits(style, road, s, d, 0.1)
-    s, d, side = s[keep], d[keep], side[keep]
+    keep = (draw[:, 0] < 0.9 * there) & fits(style, road, s, d, 0.1)
+    return s[keep], d[keep], side[keep], high
+
+
+def lamp_heads(style: Style, road: Road) -> np.ndarray:
+    """Return the heads of the street lamps in the order of s, as rows (s, x, y, z), m."""
+    s, d, side, high = _lamps(style, road)
+    x, z, _ = place(road, s, d - _ARM_M * side)
+    return np.stack([s, x, -ground(road, x, z)[0] - high, z], 1)[np.argsort(s, kind="stable")]
+
+
+def _posts(style: Style, road: Road) -> list[Things]:
+    """Return lamp posts with their arms, sign posts with their plates, and delineators."""
+    s, d, side, high = _lamps(style, road)
+    rng = stream(style.seed, "post kinds")
     grey = np.tile(_STEEL * rng.uniform(0.3, 1.3), (len(s), 1))
     size = np.tile([0.06, high / 2, 0.06], (len(s), 1))
     arm = np.tile([0.7, 0.05, 0.1], (len(s), 1))
+    shining = paint(grey, window=0.3, panes=(1.0, 1.0, 1.0), width=0.9, height=1.0, glow=6.0 * style.lamps)
     parts = [
         make(road, s, d, size, paint(grey), shape=CYLINDER),
-        make(road, s, d - 0.7 * side, arm, paint(grey), bottom_m=high),
+        make(road, s, d - _ARM_M * side, arm, shining, bottom_m=high),
     ]
     s, side, draw = slots(style, road, "signs", 23.0, 8, jitter=0.8)
     d = side * (style.half_width_m + 0.4 + 1.2 * draw[:, 0])

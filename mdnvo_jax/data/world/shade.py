@@ -8,7 +8,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jax import Array
 
-from mdnvo_jax.data.world import pavement, sky
+from mdnvo_jax.data.world import night, pavement, sky
 from mdnvo_jax.data.world.look import Colour, Look, View
 from mdnvo_jax.data.world.pavement import Lane
 from mdnvo_jax.data.world.texture import Vector, fractal, hashed, mix, pulses, value_noise, visible
@@ -17,7 +17,7 @@ from mdnvo_jax.data.world.trace import BOXES, GROUND, SKY, Hit, Shapes
 
 # Share of a pixel that counts when textures fade: a little less than all, like a sharp lens.
 _SHARPNESS = 0.8
-_OCTAVES, _GAIN = 5, 0.9
+_OCTAVES, _GAIN = 5, 1.0
 
 
 class Surface(NamedTuple):
@@ -47,7 +47,14 @@ def look_along(rays: Vector, depth: Array, focal: Array, samples: int) -> View:
 
 
 def radiance(
-    hit: Hit, view: View, shapes: Shapes, paint: Paint, lane: Lane, look: Look, shadows: tuple[Array, Array]
+    hit: Hit,
+    view: View,
+    shapes: Shapes,
+    paint: Paint,
+    lane: Lane,
+    look: Look,
+    shadows: tuple[Array, Array],
+    rotation: Array,
 ) -> Colour:
     """Return the radiance of every sample, one array `[tiles, samples]` a channel."""
     ground, away = hit.thing == GROUND, hit.thing == SKY
@@ -63,13 +70,20 @@ def radiance(
     point = tuple(
         jnp.where(away, b, jnp.where(ground, w, m)) for b, w, m in zip(beyond.point, world, skin.metres, strict=True)
     )
-    cell = jnp.where(away, beyond.cell, jnp.where(ground, 2.2, paint.grain_m[row]))
+    cell = jnp.where(away, beyond.cell, jnp.where(ground, 1.8, paint.grain_m[row]))
     footprint = jnp.where(away, beyond.footprint, stretched_m)
-    noise = fractal(point, footprint, cell, _GAIN, _OCTAVES, look.seed + 31 * paint.seed[row])
+    # Ground and sky keep their texture whatever stands nearest.
+    own = jnp.where(hit.thing >= 0, 31 * paint.seed[row], 0)
+    noise = fractal(point, footprint, cell, _GAIN, _OCTAVES, look.seed + own)
 
     floor = pavement.pave(hit.point, view, stretched_m, noise, lane, look)
     texture = jnp.maximum(1 + jnp.where(ground, floor.contrast, paint.contrast[row]) * noise, 0.15)
     direct, diffuse = _light(normal, ground, skin.above_m, paint.leafy[row], world, stretched_m, shadows, look)
+    lamps = night.lamplight(hit.point, normal, ground, view, lane.lamps, rotation, look)
+    # At night panes are lit from within, some more than others.
+    glow = paint.glow[row] * skin.pane * skin.glint**4 * (look.headlight > 0)
+    # Schlick's formula for water, at the angle of the eye.
+    mirror = jnp.where(ground, floor.shine * (0.02 + 0.4 * (1 - jnp.clip(facing, 0, 1)) ** 5), 0)
     clearness = jnp.exp(-jnp.minimum(view.distance_m, 1e4) / look.haze_m)
     heaven = sky.heaven(view, far, noise, look)
     colour = []
@@ -77,8 +91,10 @@ def radiance(
         wall = paint.albedo[:, c][row] * jnp.where(skin.roof, paint.top[row], 1) * texture
         wall = mix(wall, paint.window[:, c][row] * skin.glint, skin.pane)
         albedo = jnp.where(ground, mix(floor.colour[c] * texture, look.paint, floor.painted), wall)
-        seen = albedo * (direct * look.colours[6, c] + diffuse)
-        colour.append(jnp.where(away, heaven[c], mix(0.8 * look.colours[5, c], seen, clearness)))
+        air = 0.8 * look.daylight * look.colours[5, c]
+        seen = albedo * (direct * look.colours[6, c] + diffuse + lamps) + glow
+        seen = mix(seen, air, mirror)
+        colour.append(jnp.where(away, heaven[c], mix(air, seen, clearness)))
     return tuple(colour)
 
 
@@ -117,7 +133,7 @@ def _surface(hit: Hit, view: View, shapes: Shapes, paint: Paint, row: Array, loo
         above_m=(1 - q[1]) * size[1],
         pane=jnp.where(box & ~on_y & (count > 0), pane, 0.0),
         glint=1 + 0.7 * glint * visible(spread),
-        roof=box & (normal[1] < -0.5),
+        roof=normal[1] < -0.7,
     )
 
 

@@ -43,5 +43,5 @@ def heaven(view: View, far: Array, noise: Array, look: Look) -> Colour:
         trees, zenith, horizon = look.colours[3, c], look.colours[4, c], look.colours[5, c]
         clear = mix(horizon, zenith, rise) + glow
         distant = mix(0.35 * horizon, trees * (1 + 0.8 * noise), 0.75)
-        colour.append(jnp.where(far, distant, mix(clear, 1 + 0.25 * noise, cover)))
+        colour.append(look.daylight * jnp.where(far, distant, mix(clear, 1 + 0.25 * noise, cover)))
     return tuple(colour)

@@ -31,6 +31,11 @@ class Style(NamedTuple):
         a dash and gap; share of the dash; whether edges are marked; reflectance; how worn.
       roughness: contrast of the asphalt. cracks, patches: how many. zebra: chance of a crossing every 60 m.
       backdrop_rad: how high the distant trees or houses stand.
+      daylight: brightness of the sky's colours, 1 by day. headlight, lamps: strength of the car's own headlights and of
+        street lamps, 0 by day.
+      stone_m: size of the stones that the road is paved with, 0 for asphalt. arrows: chance of an arrow on every lane
+        every 40 m.
+      wet, rain: how wet the road is, how hard it rains, 0 to 1.
     """
 
     seed: int
@@ -73,6 +78,13 @@ class Style(NamedTuple):
     patches: float
     zebra: float
     backdrop_rad: float
+    daylight: float
+    headlight: float
+    lamps: float
+    stone_m: float
+    arrows: float
+    wet: float
+    rain: float
 
 
 def stream(seed: int, name: str) -> np.random.Generator:
@@ -85,9 +97,9 @@ def stream(seed: int, name: str) -> np.random.Generator:
 
 
 def draw_style(seed: int) -> Style:
-    """Return the style of the world `seed`; the cruising speed is flat from 0 to 28 m/s over the seeds."""
+    """Return the style of the world `seed`; the cruising speed is flat from 0 to 30 m/s over the seeds."""
     rng = stream(seed, "style")
-    cruise = rng.uniform(0, 28)
+    cruise = 0.0 if rng.random() < 0.04 else 1 + 29 * rng.random() ** 0.7
     # Slow worlds are towns, fast ones open roads, with a wide overlap.
     town = float(np.clip((19 - cruise) / 10 + rng.normal(0, 0.35), 0, 1))
     motorway = bool(cruise > 19 and rng.random() < 0.6)
@@ -95,14 +107,23 @@ def draw_style(seed: int) -> Style:
     lane = rng.uniform(3.3, 3.8) if motorway else rng.uniform(2.6, 3.6)
     shoulder = rng.uniform(0.8, 2.5) if motorway else rng.uniform(0.1, 0.6) + town * rng.choice([0.0, 2.0])
     wooded = rng.random()
-    overcast = rng.random() < 0.3
+    weather = stream(seed, "weather")
+    night, rainy = weather.random() < 0.12, weather.random() < 0.14
+    daylight, amount = (weather.uniform(0.003, 0.03) if night else 1.0), weather.uniform(0.2, 1)
+    overcast = bool(rng.random() < 0.3) or rainy
     elevation, azimuth = np.deg2rad(rng.uniform(15, 65)), rng.uniform(0, 2 * np.pi)
     sun = np.array([np.cos(elevation) * np.sin(azimuth), -np.sin(elevation), np.cos(elevation) * np.cos(azimuth)])
     sun_strength = rng.uniform(0, 0.15) if overcast else rng.uniform(0.55, 0.85)
+    # Cobbles in towns and gravel in the country bear no lines.
+    surface = stream(seed, "surface")
+    cobbles, gravel = (bool(surface.random() < share) for share in (0.2 * town, 0.12 * (cruise < 14) * (1 - town)))
+    marked = not (cobbles or gravel)
+    sky_strength = 1 - sun_strength - (0.1 if overcast else 0.0)
+    haze = np.exp(rng.uniform(np.log(300), np.log(3000)))
     return Style(
         seed=seed,
-        cruise_mps=0.0 if cruise < 1 else cruise,
-        reversing=bool(cruise < 5 and rng.random() < 0.15),
+        cruise_mps=cruise,
+        reversing=bool(cruise < 6 and rng.random() < 0.25),
         acceleration_mps2=rng.uniform(1.2, 2.8),
         stops=0.15 * town * rng.random(),
         slows=0.8 * (1 - motorway) * rng.random(),
@@ -114,32 +135,39 @@ def draw_style(seed: int) -> Style:
         lanes=lanes,
         half_width_m=lane * lanes + shoulder,
         sidewalk_m=rng.uniform(1.2, 3.0) if rng.random() < town else 0.0,
-        built=town * rng.uniform(0.3, 1.0),
-        trees=wooded * rng.uniform(0.4, 1.0),
-        hedges=rng.random() * (0.3 + 0.5 * town),
+        built=town * rng.uniform(0.4, 1.0),
+        trees=wooded**0.7 * rng.uniform(0.5, 1.0),
+        hedges=rng.random() * (0.4 + 0.5 * town),
         bushes=rng.random(),
         parked=town * rng.uniform(0, 0.8),
         poles=rng.uniform(0.1, 1.0),
         traffic=rng.uniform(0, 0.7) if motorway else rng.uniform(0, 0.4),
         rails=bool(motorway and rng.random() < 0.7) or bool(town < 0.3 and rng.random() < 0.2),
         overpasses=0.35 if motorway else 0.05,
-        colours=_colours(rng, overcast),
+        colours=_colours(rng, overcast)[[1 if gravel else 0, 1, 2, 3, 4, 5, 6]],
         sun=sun,
-        sun_strength=sun_strength,
-        sky_strength=1 - sun_strength - (0.1 if overcast else 0.0),
+        sun_strength=0.0 if night else sun_strength,
+        sky_strength=daylight * (0.9 if night else sky_strength),
         clouds=rng.uniform(0.6, 1.0) if overcast else rng.uniform(0, 0.6),
-        haze_m=float(np.exp(rng.uniform(np.log(300), np.log(3000)))),
-        centre_line=2 if motorway else int(rng.choice(3, p=[0.25, 0.55, 0.2])),
+        haze_m=float(haze * (1 - 0.7 * amount * rainy)),
+        centre_line=marked * (2 if motorway else int(rng.choice(3, p=[0.25, 0.55, 0.2]))),
         lane_period_m=rng.choice([6.0, 9.0, 12.0, 18.0]),
         lane_duty=rng.uniform(0.3, 0.5),
-        edge_line=bool(motorway or rng.random() < 0.5 * (1.2 - town)),
+        edge_line=bool(motorway or rng.random() < 0.5 * (1.2 - town)) and marked,
         paint=rng.uniform(0.4, 0.8),
         wear=rng.uniform(0.1, 0.9),
-        roughness=rng.uniform(0.15, 0.4),
+        roughness=rng.uniform(0.12, 0.45) + 0.25 * gravel,
         cracks=rng.random() * (0.4 + 0.6 * town),
         patches=rng.random() * (0.4 + 0.6 * town),
         zebra=0.25 * town * rng.random(),
         backdrop_rad=rng.uniform(0.015, 0.12) * (0.4 + wooded),
+        daylight=daylight,
+        headlight=weather.uniform(0.4, 0.9) * night,
+        lamps=weather.uniform(0.1, 0.5) * night * (weather.random() < 0.4 + 0.6 * town),
+        wet=float(rainy or weather.random() < 0.06) * weather.uniform(0.3, 1),
+        stone_m=surface.uniform(0.12, 0.45) * cobbles,
+        arrows=surface.random() ** 2 * marked,
+        rain=amount * rainy,
     )
 
 

@@ -34,6 +34,7 @@ class Paint(NamedTuple):
       width, height: share of its cell that a pane fills, across and upwards. lift: how far it is moved up, in cells.
       top: factor on the albedo of faces that look up.
       contrast, grain_m: strength and largest cell of the texture.
+      glow: radiance of the panes at night.
       leafy: 1 where light shines through and around, as through leaves. seed: of its texture.
     """
 
@@ -46,6 +47,7 @@ class Paint(NamedTuple):
     top: np.ndarray
     contrast: np.ndarray
     grain_m: np.ndarray
+    glow: np.ndarray
     leafy: np.ndarray
     seed: np.ndarray
 
@@ -79,11 +81,12 @@ def paint(
     top: np.ndarray | float = 1.0,
     contrast: np.ndarray | float = 0.15,
     grain_m: np.ndarray | float = 1.0,
+    glow: np.ndarray | float = 0.0,
     leafy: float = 0.0,
 ) -> Paint:
     """Return a `Paint` with as many rows as `albedo`, `[n, 3]`."""
     n = len(albedo)
-    columns = (np.broadcast_to(value, (n,)) for value in (width, height, lift, top, contrast, grain_m, leafy, 0))
+    columns = (np.broadcast_to(value, (n,)) for value in (width, height, lift, top, contrast, grain_m, glow, leafy, 0))
     window = np.asarray(window)
     window = np.broadcast_to(window if window.ndim == 2 else window.reshape(-1, 1), (n, 3))
     return Paint(albedo, window, np.broadcast_to(panes, (n, 3)), *columns)
@@ -97,7 +100,7 @@ def make(
     looks: Paint,
     *,
     bottom_m: np.ndarray | float = 0.0,
-    shape: int = BOX,
+    shape: int | np.ndarray = BOX,
     yaw: np.ndarray | float = 0.0,
     roll: np.ndarray | float = 0.0,
     squash: float = 1.0,
@@ -114,7 +117,7 @@ def make(
     turned = turn(heading + yaw, 1) @ np.diag([1.0, squash, 1.0]) @ turn(np.broadcast_to(roll, s.shape), 2)
     centre = np.stack([x, -height - bottom_m - half[:, 1], z], axis=1)
     axes = shear @ turned * half[:, None, :]
-    return Things(s, centre, axes, np.linalg.inv(axes), np.full(len(s), shape), -height, looks)
+    return Things(s, centre, axes, np.linalg.inv(axes), np.broadcast_to(shape, s.shape), -height, looks)
 
 
 def join(parts: list[Things]) -> Things:

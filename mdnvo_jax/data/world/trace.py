@@ -33,7 +33,7 @@ _SOLID, _LEAVES = 1, 2
 # `Hit.thing` where no thing was hit.
 GROUND, SKY = -1, -2
 # Waves, in cycles a metre, whose sum decides where a crown has gaps.
-_GAPS = ((2.4, 0.9, 1.5), (-1.6, 2.3, 1.8), (1.1, 2.9, -2.3))
+_GAPS = ((0.9, 0.35, 0.55), (-1.2, 1.7, 1.35), (1.7, 3.4, -2.9))
 # Where a pixel is sampled, by the number of samples: offsets (u, v) from its centre, in pixels.
 _OFFSETS = {
     1: ((0.0, 0.0),),
@@ -348,7 +348,8 @@ def _leaf(o: Vector, d: Vector, t: Array, thing: Solid) -> Array:
     x, y, z = (thing.radius * (o[i] + t * d[i]) for i in range(3))
     wave = jnp.float32(0)
     for kx, ky, kz in _GAPS:
-        f = kx * x + ky * y + kz * z + thing.leafy
+        # Each wave bends the next, or the gaps would lie in rows.
+        f = kx * x + ky * y + kz * z + thing.leafy + 0.3 * wave
         f = f - jnp.floor(f) - 0.5
         wave += 16 * f * (0.5 - jnp.abs(f))
     return (wave < 0.4 + 0.02 * t) | (thing.leafy == 0)

@@ -7,12 +7,13 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from mdnvo_jax import geometry
 from mdnvo_jax.data.world.cars import Traffic, draw_traffic, drive_on
 from mdnvo_jax.data.world.look import Look
-from mdnvo_jax.data.world.motion import FRAME_S, camera_poses, road_coordinate
+from mdnvo_jax.data.world.motion import CAMERA_HEIGHT_M, FRAME_S, camera_poses, draw_mount, road_coordinate
 from mdnvo_jax.data.world.pavement import CELL_M, CELLS, Lane
 from mdnvo_jax.data.world.road import BEHIND_M, NODE_M, Road, build_road
-from mdnvo_jax.data.world.scenery import furnish
+from mdnvo_jax.data.world.scenery import furnish, lamp_heads
 from mdnvo_jax.data.world.style import Style, draw_style
 from mdnvo_jax.data.world.things import BALL, BOX, Paint, Things, join, select
 from mdnvo_jax.data.world.trace import BOXES, ROUNDS, Shapes
@@ -21,6 +22,9 @@ from mdnvo_jax.data.world.trace import BOXES, ROUNDS, Shapes
 _RANGE_M = 200.0
 _NODES = 160
 _SIDE_ROADS = 4
+_LAMPS = 8
+# Where the lamps are that are not there.
+_NOWHERE_M = 1e4
 # Things this far behind the eye may still throw a shadow into view, m.
 _SHADOW_M = 25.0
 _LUMA = np.array([0.299, 0.587, 0.114])
@@ -31,7 +35,8 @@ class World(NamedTuple):
 
     Attributes:
       style: its choices. road: with hills. things: that stand still, in the order of s. traffic: cars that drive.
-      poses: `T_world_camera` in the world's own axes, `[N, 4, 4]`. s: of the car at each frame, `[N]`, m.
+      poses: `T_world_camera` in the world's own axes, `[N, 4, 4]`. motion: `T_{i+1,i}` of each frame i, `[N, 4, 4]`.
+      s: of the car at each frame, `[N]`, m. lamps: heads of street lamps in the order of s, as rows (s, x, y, z).
     """
 
     style: Style
@@ -39,7 +44,9 @@ class World(NamedTuple):
     things: Things
     traffic: Traffic
     poses: np.ndarray
+    motion: np.ndarray
     s: np.ndarray
+    lamps: np.ndarray
 
 
 class Frame(NamedTuple):
@@ -47,30 +54,44 @@ class Frame(NamedTuple):
 
     Attributes:
       rotation: camera to world, `[3, 3]`. eye_m: height of the eye above the datum of the ground.
+      motion: `T_{i+1,i}`, `[4, 4]`.
       hills: rows (amplitude, wave vector, phase at the eye), `[2, 4]`.
       shapes, paint: of the nearest things. lane: the road.
     """
 
     rotation: Array
     eye_m: Array
+    motion: Array
     hills: Array
     shapes: Shapes
     paint: Paint
     lane: Lane
 
 
-def build_world(seed: int, frames: int) -> World:
+def build_world(seed: int, frames: int, camera_height_m: tuple[float, float] = CAMERA_HEIGHT_M) -> World:
     """Return the world of `seed` with `frames` frames of motion; the first ones do not depend on how many there are."""
-    style, road, poses = path(seed, frames)
+    # One frame more than there is, for the motion of the last one.
+    style, road, poses = path(seed, frames + 1, camera_height_m)
     s = road_coordinate(road, FRAME_S * np.arange(frames))
-    return World(style, road, furnish(style, road), draw_traffic(style, road), poses, s)
+    return World(
+        style=style,
+        road=road,
+        things=furnish(style, road),
+        traffic=draw_traffic(style, road),
+        poses=poses[:-1],
+        motion=geometry.inverse(poses[1:]) @ poses[:-1],
+        s=s,
+        lamps=lamp_heads(style, road),
+    )
 
 
-def path(seed: int, frames: int) -> tuple[Style, Road, np.ndarray]:
+def path(
+    seed: int, frames: int, camera_height_m: tuple[float, float] = CAMERA_HEIGHT_M
+) -> tuple[Style, Road, np.ndarray]:
     """Return (style, road, poses) of a world: its motion without what stands beside the road, which takes longer."""
     style = draw_style(seed)
     road = build_road(style, frames, FRAME_S)
-    return style, road, camera_poses(style, road, frames)
+    return style, road, camera_poses(style, road, frames, draw_mount(seed, camera_height_m))
 
 
 def frame_at(world: World, index: int, channels: int) -> Frame:
@@ -80,6 +101,7 @@ def frame_at(world: World, index: int, channels: int) -> Frame:
     return Frame(
         rotation=single(pose[:3, :3]),
         eye_m=single(-pose[1, 3]),
+        motion=single(world.motion[index]),
         hills=_hills(world.road, pose[:3, 3]),
         shapes=_shapes(things, rows, pose[:3, 3]),
         paint=_paint(things.paint, rows, channels),
@@ -182,7 +204,10 @@ def _lane(world: World, s: float, eye: np.ndarray, forward: np.ndarray) -> Lane:
     near = np.argsort(np.abs(road.side[:, 0] - s), kind="stable")[:_SIDE_ROADS]
     side = np.full((_SIDE_ROADS, 7), -1.0)
     side[: len(near)] = road.side[near, 1:] - np.array([eye[0], eye[2], 0, 0, 0, 0, 0])
-    return Lane(single(nodes), single(corner), single(side), single(eye))
+    lamps = np.full((_LAMPS, 3), _NOWHERE_M)
+    near = np.argsort(np.abs(world.lamps[:, 0] - s - 20 * ahead), kind="stable")[:_LAMPS]
+    lamps[: len(near)] = world.lamps[near, 1:] - eye
+    return Lane(single(nodes), single(corner), single(side), single(eye), single(lamps))
 
 
 def _direction(road: Road, s: float) -> np.ndarray:
