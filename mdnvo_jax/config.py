@@ -108,6 +108,12 @@ class DataConfig:
     worlds: int = 64
     world_frames: int = 120
     validation_worlds: int = 8
+    # Height of the camera above the road that the labels stand for, m; 0: not known, or not one. KITTI's is 1.65.
+    # A single camera sees the ground plane up to scale, so prediction can rescale to the height of another camera.
+    camera_height_m: float = 0.0
+    # Shares of `camera_height_m` between which rendered worlds draw the height of their camera; the labels are then
+    # scaled back to `camera_height_m`, so that they follow the ground and not the size of cars and houses.
+    camera_height_shares: tuple[float, ...] = (0.94, 1.06)
 
 
 @dataclasses.dataclass(frozen=True)

@@ -166,6 +166,10 @@ def synthetic_sequences(seeds: Many[int], config: Config) -> list[Sequence]:
     if image.camera and image.rectify:
         fx, fy, cx, cy = image.camera
         camera = fx, fy, cx, cy
+    heights = {}
+    if config.data.camera_height_m:
+        low, high = (config.data.camera_height_m * share for share in config.data.camera_height_shares)
+        heights = {"camera_height_m": (low, high), "scaled_to_height_m": config.data.camera_height_m}
     return [
         synthetic.drive(
             seed,
@@ -174,6 +178,7 @@ def synthetic_sequences(seeds: Many[int], config: Config) -> list[Sequence]:
             width=image.width,
             channels=image.channels,
             camera=camera,
+            **heights,
         )
         for seed in seeds
     ]

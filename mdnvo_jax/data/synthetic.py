@@ -17,7 +17,7 @@ import numpy as np
 from mdnvo_jax import geometry
 from mdnvo_jax.data.sequence import Camera, Sequence
 from mdnvo_jax.data.world import film, render, world
-from mdnvo_jax.data.world.motion import CAMERA_HEIGHT_M, FRAME_S
+from mdnvo_jax.data.world.motion import CAMERA_HEIGHT_M, FRAME_S, draw_mount
 from mdnvo_jax.data.world.style import stream
 from mdnvo_jax.errors import InputError
 
@@ -77,6 +77,7 @@ def drive(
     samples: int = 2,
     effects: float = 1.0,
     camera_height_m: tuple[float, float] = CAMERA_HEIGHT_M,
+    scaled_to_height_m: float | None = None,
 ) -> Sequence:
     """Return a drive through the world of `seed`, its frames rendered when they are read.
 
@@ -92,6 +93,8 @@ def drive(
         rain on the glass, JPEG; 0 leaves them out.
       camera_height_m: range from which the world draws the height of its camera above the road, 0.3 to 5 m. Widen it
         to (1.2, 2.2) for cameras in other vehicles: the same motion then looks slower the higher the camera is.
+      scaled_to_height_m: scale the world, its poses that is, so that the camera sits at this height: the frames do not
+        change. Labels then follow the ground plane alone, and things beside the road vary in size.
 
     Returns:
       A sequence with poses (the first is the identity), timestamps and camera; `read` may be called by many threads.
@@ -111,6 +114,8 @@ def drive(
     poses = geometry.inverse(poses[0]) @ poses
     # Not only to rounding.
     poses[0] = np.eye(4)
+    if scaled_to_height_m is not None:
+        poses[:, :3, 3] *= scaled_to_height_m / draw_mount(seed, camera_height_m).height_m
     look = functools.cache(lambda: jax.device_put(world.look_of(style, channels)))
     kept: collections.OrderedDict[int, np.ndarray] = collections.OrderedDict()
     lock = threading.Lock()
