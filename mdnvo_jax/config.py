@@ -59,6 +59,9 @@ class ModelConfig:
     components: int = 3
     # "independent": equations 3 to 5, a product over dimensions. "joint": a mixture of diagonal Gaussians.
     coupling: Literal["independent", "joint"] = "independent"
+    # Weight of an auxiliary loss on optical flow, which a 1x1 convolution reads off conv3_1 while training; for data
+    # with exact flow, which rendered drives have. 0: no such layer. Not given in the paper, which starts from FlowNet.
+    flow_weight: float = 0.0
     # Floors of the predicted standard deviation. Not given in the paper, whose density has none: without one a
     # dimension that never varies runs to a likelihood of infinity.
     translation_floor_m: float = 1e-3
@@ -102,6 +105,9 @@ class DataConfig:
     mirror: float = 0.0
     # Strength of the photometric augmentation (gain, gamma, offset, noise); 0 turns it off.
     photometric: float = 0.0
+    # Chance that a window is shown as a camera with a narrower view would have it, the edge repeated outwards, as
+    # bringing such a camera's frames to the virtual camera does.
+    narrow: float = 0.0
     # Threads that read and decode.
     threads: int = 2
     # Worlds and frames of the synthetic data set; validation worlds come on top and are disjoint by seed.
@@ -134,10 +140,17 @@ class TrainingConfig:
     plateau_factor: float = 0.7
     # Least absolute improvement of the validation loss that counts. Absolute, since a NLL is often negative.
     plateau_threshold: float = 1e-4
+    # "plateau": the paper's. "cosine": from the learning rate to zero over all steps, which `steps_per_epoch` must say.
+    schedule: Literal["plateau", "cosine"] = "plateau"
+    # Decoupled weight decay (AdamW). 0: Adam, the paper's.
+    weight_decay: float = 0.0
     # Largest global norm of the gradient; 0 turns clipping off. Not given in the paper.
     gradient_clip: float = 10.0
     # "sequence": equations 6 and 7, minus the log of the mean likelihood. "mean": the mean of the NLLs.
     reduction: Literal["sequence", "mean"] = "sequence"
+    # Beta-NLL (Seitzer et al. 2022): weights each NLL by sigma^(2 beta), sigma in standardised units and without a
+    # gradient, so that steps of large sigma still teach the mean. 0: the paper's NLL. For "mean" only.
+    beta: float = 0.0
     # Weight of the rotation in DeepVO's loss (its paper: 100), for head "regression" only.
     kappa: float = 100.0
     # Stack parameters made by bin/convert_flownet; empty: Xavier everywhere. Paper: FlowNet.

@@ -7,6 +7,7 @@ import numpy as np
 
 from mdnvo_jax.data import images
 from mdnvo_jax.data.sequence import Camera
+from mdnvo_jax.model.conv import FLOW_STRIDE
 
 # What one draw of strength 1 does, as standard deviations: natural logarithms of gain and gamma of the window, of the
 # gain of one colour and of one frame; offset and noise in grey levels of 255. Exposure and tone differ much between
@@ -18,6 +19,8 @@ _LOG_COLOUR_GAIN = 0.05
 _LOG_FRAME_GAIN = 0.02
 _OFFSET = 12.0
 _NOISE = 4.0
+# Largest shares of a frame that a narrower view lacks at its top, bottom, left and right.
+_NARROW = (0.3, 0.12, 0.25, 0.25)
 # Rows and columns by which the noise of one frame may be moved against that of another.
 _NOISE_SHIFT = 64
 # 256 values that are equally likely under the standard normal distribution: a byte draws one of them, at a tenth of
@@ -36,6 +39,37 @@ def mirror_frame(image: np.ndarray, camera: Camera | None) -> np.ndarray:
     if abs(centre - (width - 1) / 2) < 1e-6:
         return image[:, ::-1]
     return images.resample(image, (-1.0, 2 * centre), (1.0, 0.0), (image.shape[0], width))
+
+
+def mirror_flow(flow: np.ndarray, camera: Camera | None) -> np.ndarray:
+    """Return the optical flow `[..., h, w, 2]` of mirrored frames, on the network's map: `mirror_frame`'s labels.
+
+    Cell i of the map sees pixel 8 i, so its mirror `2 cx - 8 i` lies between cells: the two about it are blended. NaN
+    where one of them is not known or not on the map. Without a `camera` there is no saying where: all NaN.
+    """
+    width = flow.shape[-2]
+    if camera is None:
+        return np.full_like(flow, np.nan)
+    place = 2 * camera[2] / FLOW_STRIDE - np.arange(width)
+    left = np.floor(place).astype(int)
+    share = (place - left)[:, None]
+    known = (left >= 0) & (left + (share[:, 0] > 0) < width)
+    first, second = (flow[..., np.clip(column, 0, width - 1), :] for column in (left, left + 1))
+    blended = np.where(share > 0, (1 - share) * first + share * second, first) * (-1.0, 1.0)
+    return np.where(known[:, None], blended, np.nan).astype(flow.dtype)
+
+
+def narrow(frames: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Return a window of frames, `[T+1, H, W, C]`, as if a camera of narrower view had taken it: edges repeated.
+
+    What lies outside of a rectangle that `rng` draws (up to `_NARROW` of the frame cut off at each side) shows the
+    rectangle's nearest pixel, as `images.prepare` fills what a camera does not see.
+    """
+    height, width = frames.shape[1:3]
+    top, bottom, left, right = (rng.random() * share for share in _NARROW)
+    rows = np.clip(np.arange(height), round(top * height), round((1 - bottom) * height) - 1)
+    columns = np.clip(np.arange(width), round(left * width), round((1 - right) * width) - 1)
+    return frames[:, rows][:, :, columns]
 
 
 def photometric(frames: np.ndarray, strength: float, rng: np.random.Generator) -> np.ndarray:

@@ -1,7 +1,8 @@
 """Prepared frames on disk: decoded, rectified and resized once, memory-mapped ever after.
 
 For each sequence the folder holds `NAME.npy`, uint8 `[N, H, W, C]`, and `NAME.json`: poses, times, camera, image
-configuration and a fingerprint of the source. The JSON file is written last: a sequence without one is unfinished.
+configuration and a fingerprint of the source. Rendered drives have `NAME.flow.npy` as well, float16 `[N, h, w, 2]`,
+optical flow on a map of the network. The JSON file is written last: a sequence without one is unfinished.
 """
 
 import concurrent.futures
@@ -168,14 +169,28 @@ def _open(path: Path, stored: dict[str, Any], image_config: ImageConfig) -> Sequ
     if stored["poses"] is not None:
         poses = np.tile(np.eye(4), (stored["count"], 1, 1))
         poses[:, :3] = np.array(stored["poses"]).reshape(-1, 3, 4)
+    flow = _open_flow(path, stored) if stored.get("flow") else None
     return Sequence(
         name=stored["name"],
         count=stored["count"],
+        flow=None if flow is None else lambda index: np.asarray(flow[index], np.float32),
         read=lambda index: np.asarray(frames[index]),
         timestamps=None if stored["timestamps"] is None else np.array(stored["timestamps"]),
         poses=poses,
         camera=None if stored["camera"] is None else tuple(stored["camera"]),
     )
+
+
+def _open_flow(path: Path, stored: dict[str, Any]) -> np.ndarray:
+    """Return the optical flow beside `path`, a JSON file of a cache."""
+    file = path.with_suffix(".flow.npy")
+    try:
+        flow = np.lib.format.open_memmap(file, mode="r")
+    except (OSError, ValueError) as error:
+        raise InputError(f"{file} is damaged ({error}): remove it and {path.name}, then prepare again") from error
+    if len(flow) != stored["count"]:
+        raise InputError(f"{file} has {len(flow)} frames, expected {stored['count']}: remove it and {path.name}")
+    return flow
 
 
 def _write(
@@ -208,7 +223,11 @@ def _write(
                 pool.shutdown(cancel_futures=True)
                 raise
         frames.flush()
+    if sequence.flow is not None:
+        with whole_file(path.with_suffix(".flow.npy")) as temporary:
+            np.save(temporary, np.stack([sequence.flow(index) for index in range(sequence.count)]).astype(np.float16))
     description = {
+        "flow": sequence.flow is not None,
         "name": sequence.name,
         "count": sequence.count,
         "camera": images.prepared_camera((first.shape[0], first.shape[1]), sequence.camera, image_config),

@@ -23,7 +23,8 @@ def load_split(config: Config) -> tuple[list[Sequence], list[Sequence], ImageCon
     `data.validation_sequences`, or else the tail of every training sequence. Data set "nuscenes": the scenes named, and
     for an empty list the split of `nuscenes`, of which scenes that cannot be used (too short, images not on disk) are
     left out with a line on stderr. Data set "synthetic": worlds of the seeds 0, 1, ... for training and
-    `VALIDATION_SEED`, ... for validation, rendered when read (`TEST_SEED`, ... are kept for tests of the result).
+    `VALIDATION_SEED`, ... for validation, from the cache where given, else rendered when read (`TEST_SEED`, ... are
+    kept for tests of the result).
 
     Raises:
       InputError: a sequence is missing or malformed, or training and validation share one.
@@ -34,8 +35,8 @@ def load_split(config: Config) -> tuple[list[Sequence], list[Sequence], ImageCon
             raise InputError(
                 f"data.worlds {data.worlds} and data.validation_worlds {data.validation_worlds}: expected 1 or more"
             )
-        train = synthetic_sequences(range(data.worlds), config)
-        validation = synthetic_sequences(range(VALIDATION_SEED, VALIDATION_SEED + data.validation_worlds), config)
+        seeds = range(data.worlds), range(VALIDATION_SEED, VALIDATION_SEED + data.validation_worlds)
+        train, validation = (_worlds(part, config) for part in seeds)
     elif data.dataset == "nuscenes":
         train, validation = (
             nuscenes_sequences(names, config) if names else _nuscenes_part(part, config)
@@ -154,22 +155,32 @@ def _nuscenes_part(part: str, config: Config) -> list[Sequence]:
     return usable
 
 
+def _worlds(seeds: Many[int], config: Config) -> list[Sequence]:
+    """Return rendered drives from the cache where the configuration names one, else rendered when read."""
+    drives = synthetic_sequences(seeds, config)
+    if not config.data.cache:
+        return drives
+    return cache.read_cache(config.data.cache, config.image, [drive.name for drive in drives])
+
+
 def synthetic_sequences(seeds: Many[int], config: Config) -> list[Sequence]:
     """Return a rendered drive for each seed, of `data.world_frames` frames at the network's size.
 
     Frames are rendered for the virtual camera where there is one, so that nothing is left to rectify.
     """
     from mdnvo_jax.data import synthetic
+    from mdnvo_jax.data.world.motion import CAMERA_HEIGHT_M
 
     image = config.image
     camera = None
     if image.camera and image.rectify:
         fx, fy, cx, cy = image.camera
         camera = fx, fy, cx, cy
-    heights = {}
-    if config.data.camera_height_m:
-        low, high = (config.data.camera_height_m * share for share in config.data.camera_height_shares)
-        heights = {"camera_height_m": (low, high), "scaled_to_height_m": config.data.camera_height_m}
+    height_m = config.data.camera_height_m or None
+    drawn_m = CAMERA_HEIGHT_M
+    if height_m is not None:
+        low, high = config.data.camera_height_shares
+        drawn_m = low * height_m, high * height_m
     return [
         synthetic.drive(
             seed,
@@ -178,7 +189,8 @@ def synthetic_sequences(seeds: Many[int], config: Config) -> list[Sequence]:
             width=image.width,
             channels=image.channels,
             camera=camera,
-            **heights,
+            camera_height_m=drawn_m,
+            scaled_to_height_m=height_m,
         )
         for seed in seeds
     ]

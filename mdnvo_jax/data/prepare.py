@@ -1,4 +1,4 @@
-"""The command line bin/prepare_kitti: decode and resize KITTI or nuScenes once, so that training never does."""
+"""The command line bin/prepare_kitti: decode and resize KITTI or nuScenes, or render worlds, once for all."""
 
 import argparse
 import dataclasses
@@ -16,9 +16,9 @@ def main(arguments: Sequence[str]) -> None:
       InputError: an argument is unusable, the data are missing or malformed, or the disk is too small.
     """
     parser = Parser(prog="prepare_kitti", description="Decode and resize sequences once, for data.cache.")
-    parser.add_argument("--root", required=True, help="folder that holds sequences/ and poses/, or nuScenes' samples/")
+    parser.add_argument("--root", help="folder that holds sequences/ and poses/, or nuScenes' samples/")
     parser.add_argument("--output", required=True, help="folder to write into; what is finished there is kept")
-    parser.add_argument("--dataset", choices=("kitti", "nuscenes"), help="kind of data (default: kitti)")
+    parser.add_argument("--dataset", choices=("kitti", "nuscenes", "synthetic"), help="kind (default: kitti)")
     parser.add_argument(
         "--sequences", nargs="+", metavar="NAME", help="such as 00 01 or scene-0061 (default: all that can be used)"
     )
@@ -43,10 +43,17 @@ def main(arguments: Sequence[str]) -> None:
     if min(image.height, image.width) < 1:
         raise InputError(f"--height {image.height} --width {image.width}: expected 1 or more")
     given = _given(options, ("dataset", "camera_folder", "version"))
-    data = dataclasses.replace(config.data, root=options.root, cache="", **given)
+    data = dataclasses.replace(config.data, root=options.root or "", cache="", **given)
     config = dataclasses.replace(config, image=image, data=data)
     names = options.sequences
-    if data.dataset == "nuscenes":
+    if data.dataset == "synthetic":
+        if options.root or names:
+            raise InputError("--dataset synthetic takes its worlds from --config: leave out --root and --sequences")
+        train, validation, _ = load.load_split(config)
+        sequences = [*train, *validation]
+    elif not options.root:
+        raise InputError(f"--root is missing: give the folder of {data.dataset}")
+    elif data.dataset == "nuscenes":
         sequences = load.nuscenes_sequences(names, config) if names else load.usable_scenes(config, least=2)
         if not sequences:
             raise InputError(f"{data.root} has no scene of {data.version} with two frames and all its images on disk")

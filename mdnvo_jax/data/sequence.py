@@ -26,6 +26,8 @@ class Sequence:
       camera: intrinsics of the decoded frame, or None.
       paths: what to call each frame in a message, `N` names, or empty: the name and the index are used.
       in_order: whether frames are cheap to read in order only, as those of a video are.
+      flow: takes a frame's index and returns the optical flow to the next frame on a map of the network
+        (`network.flow_size`), in pixels of that map, `[h, w, 2]`; NaN where it is not known. None where none is known.
 
     Raises:
       InputError: timestamps, poses or paths are not one a frame, or are not finite.
@@ -39,6 +41,7 @@ class Sequence:
     camera: Camera | None = None
     paths: abc.Sequence[str] = ()
     in_order: bool = False
+    flow: abc.Callable[[int], np.ndarray] | None = None
 
     def __post_init__(self) -> None:
         for what, values, shape in (("timestamps", self.timestamps, ()), ("poses", self.poses, (4, 4))):
@@ -79,10 +82,12 @@ class Sequence:
         """
         if not 0 <= start < stop <= self.count:
             raise InputError(f"sequence {self.name} has {self.count} frames: frames {start} to {stop} are not in it")
+        flow = self.flow
         return dataclasses.replace(
             self,
             count=stop - start,
             read=lambda index: self.read(start + index),
+            flow=None if flow is None else lambda index: flow(start + index),
             timestamps=None if self.timestamps is None else self.timestamps[start:stop],
             poses=None if self.poses is None else self.poses[start:stop],
             paths=self.paths[start:stop],

@@ -20,6 +20,7 @@ from mdnvo_jax.data.world import film, render, world
 from mdnvo_jax.data.world.motion import CAMERA_HEIGHT_M, FRAME_S, draw_mount
 from mdnvo_jax.data.world.style import stream
 from mdnvo_jax.errors import InputError
+from mdnvo_jax.model.conv import FLOW_LAYERS, FLOW_STRIDE, map_size
 
 # Intrinsics and size of KITTI's left grey camera, sequence 00.
 _KITTI_CAMERA = (718.856, 718.856, 607.1928, 185.2157)
@@ -152,7 +153,19 @@ def drive(
         timestamps=FRAME_S * np.arange(frames),
         poses=poses,
         camera=camera,
+        flow=functools.partial(_flow_map, seed, frames, (height, width), camera, camera_height_m),
     )
+
+
+def _flow_map(
+    seed: int, frames: int, size: tuple[int, int], camera: Camera, camera_height_m: tuple[float, float], index: int
+) -> np.ndarray:
+    """Return the flow of frame `index` of a drive on the network's map, `[h, w, 2]`; see `Sequence.flow`.
+
+    Cell i of the map sees what pixel `FLOW_STRIDE * i` does: every layer before it pads by (kernel - 1) / 2.
+    """
+    fx, fy, cx, cy = (value / FLOW_STRIDE for value in camera)
+    return _truth(seed, frames, index, map_size(*size, FLOW_LAYERS), (fx, fy, cx, cy), camera_height_m).flow
 
 
 def truth(
@@ -176,6 +189,13 @@ def truth(
     camera = _checked(seed, frames, height, width, camera, camera_height_m)
     if not 0 <= index < frames:
         raise InputError(f"frame {index} of a drive of {frames} frames: expected 0 to {frames - 1}")
+    return _truth(seed, frames, index, (height, width), camera, camera_height_m)
+
+
+def _truth(
+    seed: int, frames: int, index: int, size: tuple[int, int], camera: Camera, camera_height_m: tuple[float, float]
+) -> Truth:
+    """Return `truth` of arguments that are in order."""
     # One frame more than the drive has, for the motion of the last one.
     whole = _world(seed, frames + 1, camera_height_m)
     depth, flow, moving = render.geometry(
@@ -183,8 +203,8 @@ def truth(
         world.moved_at(whole, index),
         world.single(geometry.inverse(whole.poses[index + 1]) @ whole.poses[index]),
         world.single(camera),
-        height=height,
-        width=width,
+        height=size[0],
+        width=size[1],
     )
     return Truth(np.asarray(depth), np.asarray(flow), np.asarray(moving))
 

@@ -14,6 +14,7 @@ from mdnvo_jax.config import Config, DataConfig, ImageConfig
 from mdnvo_jax.data import augment, images
 from mdnvo_jax.data.sequence import Sequence
 from mdnvo_jax.errors import InputError
+from mdnvo_jax.model.network import flow_size
 
 # Least standard deviation of a label (m, then rad): dividing by less would blow up a dimension that hardly varies.
 STD_FLOOR = np.array([1e-3] * 3 + [1e-4] * 3)
@@ -35,10 +36,11 @@ _Labels = dict[tuple[int, int], np.ndarray]
 
 
 class _Example(NamedTuple):
-    """A window as read: frames, one more than labels `[steps, 6]`."""
+    """A window as read: frames, one more than labels `[steps, 6]`, and where asked for flow `[steps, h, w, 2]`."""
 
     frames: Many[np.ndarray]
     labels: np.ndarray
+    flow: np.ndarray | None = None
 
 
 def resolve_camera(sequences: Many[Sequence], image_config: ImageConfig) -> ImageConfig:
@@ -185,7 +187,9 @@ def training_batches(
     """Return an endless iterator over batches of augmented training windows, in another order every epoch.
 
     A batch is a dict of images `[B, T+1, H, W, C]` uint8, steps `[B, T, 6]` float32 in m and rad, and mask `[B, T]`
-    bool, False for padding (which repeats the last frame). The remainder of an epoch that fills no batch is dropped.
+    bool, False for padding (which repeats the last frame); with `model.flow_weight` also flow `[B, T, h, w, 2]`
+    float32 on the map of `network.flow_size`, NaN where it is not known (also at strides above 1, backwards, in
+    padding). The remainder of an epoch that fills no batch is dropped.
     What comes depends on `seed`, sequences and configuration only, whatever the number of threads; the iterator's
     `get_state()` is a small dict, from which `set_state` on a new iterator continues exactly.
 
@@ -259,12 +263,20 @@ def _training_window(
     if reverse:
         indices, labels = indices[::-1], labels[::-1]
     frames, cameras = _frames(sequence, indices, config.image)
+    flow = None
+    if config.model.flow_weight:
+        flow = np.full((steps, *flow_size(config.image), 2), np.nan, np.float32)
+        if sequence.flow is not None and window.stride == 1 and not reverse:
+            flow = np.stack([sequence.flow(int(index)) for index in indices[:-1]])
     if mirror:
         frames = [augment.mirror_frame(frame, camera) for frame, camera in zip(frames, cameras, strict=True)]
         labels = geometry.mirror_step(labels)
+        flow = None if flow is None else augment.mirror_flow(flow, cameras[0])
+    if rng.random() < data.narrow:
+        frames = list(augment.narrow(np.stack(frames), rng))
     if data.photometric > 0:
         frames = list(augment.photometric(np.stack(frames), data.photometric, rng))
-    return _Example(frames, labels)
+    return _Example(frames, labels, flow)
 
 
 def _frames(
@@ -289,13 +301,18 @@ def _stacked(examples: Many[_Example], window: int) -> dict[str, np.ndarray]:
     pixels = np.empty((len(examples), window + 1, *examples[0].frames[0].shape), np.uint8)
     steps = np.zeros((len(examples), window, 6), np.float32)
     mask = np.zeros((len(examples), window), bool)
-    for row, (frames, labels) in enumerate(examples):
-        count = len(labels)
+    for row, example in enumerate(examples):
+        count = len(example.labels)
         for column in range(window + 1):
-            pixels[row, column] = frames[min(column, count)]
-        steps[row, :count] = labels
+            pixels[row, column] = example.frames[min(column, count)]
+        steps[row, :count] = example.labels
         mask[row, :count] = True
-    return {"images": pixels, "steps": steps, "mask": mask}
+    batch = {"images": pixels, "steps": steps, "mask": mask}
+    if examples[0].flow is not None:
+        batch["flow"] = np.full((len(examples), window, *examples[0].flow.shape[1:]), np.nan, np.float32)
+        for row, example in enumerate(examples):
+            batch["flow"][row, : len(example.labels)] = example.flow
+    return batch
 
 
 def _share(config: Config, world: int) -> int:

@@ -1,5 +1,6 @@
 """The convolution stack: nine layers as in FlowNetS and DeepVO, each with BatchNorm, LeakyReLU and dropout."""
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import flax.linen as nn
@@ -38,6 +39,10 @@ LAYERS = (
     Layer("conv6", 3, 2, 1024),
 )
 
+# The layers up to the one that optical flow is read off while training: the last at this stride in each direction.
+FLOW_LAYERS = LAYERS[:4]
+FLOW_STRIDE = 8
+
 # FlowNet's LeakyReLU; flax's own default is 0.01.
 LEAKY_SLOPE = 0.1
 # torch's defaults: running <- 0.9 running + 0.1 batch.
@@ -50,9 +55,9 @@ def layer_channels(layer: Layer, multiplier: float) -> int:
     return max(1, round(layer.channels * multiplier))
 
 
-def map_size(height: int, width: int) -> tuple[int, int]:
-    """Return rows and columns of the stack's output for images of `height` x `width` pixels."""
-    for layer in LAYERS:
+def map_size(height: int, width: int, layers: Sequence[Layer] = LAYERS) -> tuple[int, int]:
+    """Return rows and columns of the maps after `layers` for images of `height` x `width` pixels."""
+    for layer in layers:
         height = (height + 2 * layer.padding - layer.kernel) // layer.stride + 1
         width = (width + 2 * layer.padding - layer.kernel) // layer.stride + 1
     return height, width
@@ -129,9 +134,13 @@ class ConvStack(nn.Module):
     dropout: float
     products: Products = "float32"
 
-    @nn.compact
     def __call__(self, pairs: Array, mask: Array, *, train: bool) -> Array:
-        """Return the maps of frame pairs.
+        """Return the last of `maps`: `[N, h, w, D]` with h, w of `map_size` and D = 1024 * multiplier."""
+        return self.maps(pairs, mask, train=train)[-1]
+
+    @nn.compact
+    def maps(self, pairs: Array, mask: Array, *, train: bool) -> tuple[Array, ...]:
+        """Return the maps of frame pairs after each layer.
 
         Args:
           pairs: two frames stacked on channels, normalised, `[N, H, W, 2 * C]`.
@@ -139,10 +148,12 @@ class ConvStack(nn.Module):
           train: whether to drop units, normalise with the batch and update the collection "batch_stats".
 
         Returns:
-          `[N, h, w, D]` with h, w of `map_size` and D = 1024 * multiplier.
+          Nine times `[N, h, w, D]`.
         """
+        maps = []
         for layer in LAYERS:
             channels = layer_channels(layer, self.multiplier)
             block = ConvBlock(layer, channels, self.dropout, self.products, name=layer.name)
             pairs = block(pairs, mask, train=train)
-        return pairs
+            maps.append(pairs)
+        return tuple(maps)

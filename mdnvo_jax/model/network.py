@@ -10,7 +10,7 @@ from jax import Array
 
 from mdnvo_jax.config import ImageConfig, ModelConfig
 from mdnvo_jax.model.bilstm import LstmParams, bilstm, init_lstm
-from mdnvo_jax.model.conv import LAYERS, ConvStack, layer_channels, map_size
+from mdnvo_jax.model.conv import FLOW_LAYERS, LAYERS, ConvStack, layer_channels, map_size
 from mdnvo_jax.model.head import raw_size
 from mdnvo_jax.model.normalise import normalise
 
@@ -41,6 +41,8 @@ class Network(nn.Module):
             ),
         )
         self.head = nn.Dense(raw_size(config), kernel_init=nn.initializers.glorot_uniform())
+        if config.flow_weight:
+            self.flow = nn.Conv(2, (1, 1), kernel_init=nn.initializers.glorot_uniform())
 
     def __call__(self, images: Array, mask: Array, *, train: bool = False) -> Array:
         """Return the raw outputs of every step of windows of frames.
@@ -55,6 +57,14 @@ class Network(nn.Module):
         Returns:
           `[B, T, D]` in standardised units, D of `head.raw_size`; see `head.mixture_from_outputs`.
         """
+        return self.with_flow(images, mask, train=train)[0]
+
+    def with_flow(self, images: Array, mask: Array, *, train: bool = False) -> tuple[Array, Array | None]:
+        """Return (the outputs of `__call__`, optical flow where `model_config.flow_weight` asks for it).
+
+        The flow is that from the first frame of a pair to the second, in pixels of a map of `flow_size`,
+        `[B, T, h, w, 2]`. Only training uses it: prediction never computes it.
+        """
         batch, frames = images.shape[:2]
         if mask.shape != (batch, frames - 1):
             raise ValueError(f"images {images.shape} and mask {mask.shape}: expected a mask of {(batch, frames - 1)}")
@@ -63,11 +73,15 @@ class Network(nn.Module):
             raise ValueError(f"found frames of shape {images.shape[2:]}, expected {expected} as in the image config")
         normalised = normalise(images, self.image_config.normalisation)
         pairs = jnp.concatenate([normalised[:, :-1], normalised[:, 1:]], axis=-1)
-        maps = self.stack(pairs.reshape(batch * (frames - 1), *pairs.shape[2:]), mask.reshape(-1), train=train)
-        features = maps.reshape(batch, frames - 1, -1)
+        maps = self.stack.maps(pairs.reshape(batch * (frames - 1), *pairs.shape[2:]), mask.reshape(-1), train=train)
+        features = maps[-1].reshape(batch, frames - 1, -1)
         dropout = self.model_config.lstm_dropout
         rng = self.make_rng("dropout") if train and dropout > 0 else None
-        return self.head(bilstm(self.lstm, features, mask, dropout=dropout, rng=rng))
+        outputs = self.head(bilstm(self.lstm, features, mask, dropout=dropout, rng=rng))
+        if not self.model_config.flow_weight:
+            return outputs, None
+        flow = self.flow(maps[len(FLOW_LAYERS) - 1])
+        return outputs, flow.reshape(batch, frames - 1, *flow.shape[1:])
 
 
 def build(image_config: ImageConfig, model_config: ModelConfig) -> Network:
@@ -79,6 +93,11 @@ def feature_size(image_config: ImageConfig, model_config: ModelConfig) -> int:
     """Return the number of features F of a pair: the stack's last maps, flattened."""
     rows, columns = map_size(image_config.height, image_config.width)
     return rows * columns * layer_channels(LAYERS[-1], model_config.width)
+
+
+def flow_size(image_config: ImageConfig) -> tuple[int, int]:
+    """Return rows and columns of the maps that optical flow is read off: `conv.FLOW_STRIDE` pixels in one."""
+    return map_size(image_config.height, image_config.width, FLOW_LAYERS)
 
 
 def initialise(network: Network, rng: Array, image_config: ImageConfig, steps: int) -> Variables:

@@ -23,7 +23,14 @@ from mdnvo_jax.model.flownet import load_stack
 from mdnvo_jax.model.head import Labels
 from mdnvo_jax.model.network import Network, build
 from mdnvo_jax.training import checkpoint, logs, parallel, step
-from mdnvo_jax.training.state import TRAIN_METRICS, State, initial_state, initial_variables, state_template
+from mdnvo_jax.training.state import (
+    TRAIN_METRICS,
+    State,
+    initial_state,
+    initial_variables,
+    schedule_scale,
+    state_template,
+)
 
 # Steps between two rows of TensorBoard.
 _LOG_EVERY = 10
@@ -82,6 +89,7 @@ def train(config: Config, workdir: Path, *, resume: bool = False) -> str:
       NonFiniteError: the training diverged; the last checkpoint is kept.
       Stopped: SIGTERM or SIGINT ended it; a checkpoint of the last step is kept.
     """
+    _check_loss(config)
     _claim(workdir, resume)
     train_set, validation_set, image = load_split(config)
     config = dataclasses.replace(config, image=image)
@@ -121,6 +129,18 @@ def _claim(workdir: Path, resume: bool) -> None:
         workdir.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise InputError(f"cannot make the folder {workdir} ({error.strerror}): choose another --workdir") from error
+
+
+def _check_loss(config: Config) -> None:
+    """Refuse choices of the loss and the schedule that contradict each other."""
+    training = config.training
+    if training.schedule == "cosine" and not training.steps_per_epoch:
+        raise InputError("training.schedule cosine needs to know how long it is: set training.steps_per_epoch")
+    if training.beta and (training.reduction != "mean" or config.model.head != "mixture"):
+        raise InputError(
+            f"training.beta {training.beta} with training.reduction {training.reduction} and model.head "
+            f"{config.model.head}: beta-NLL is defined for reduction mean and head mixture"
+        )
 
 
 def _check_same(config: Config, workdir: Path) -> None:
@@ -249,7 +269,8 @@ class _Run:
         row = {
             "epoch": epoch + 1,
             "step": int(state.step),
-            "learning_rate": self.config.training.learning_rate * float(state.plateau.scale),
+            "learning_rate": self.config.training.learning_rate
+            * float(schedule_scale(self.config.training, state.plateau, state.step)),
             **{name: float(state.sums[name]) / self.steps_per_epoch for name in TRAIN_METRICS},
             **{name: float(value) for name, value in step.validation_metrics(sums).items()},
         }

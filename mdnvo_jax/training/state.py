@@ -63,8 +63,10 @@ TRAIN_METRICS = (
 
 
 def make_optimiser(config: TrainingConfig) -> optax.GradientTransformation:
-    """Return Adam with clipping by the global norm; the plateau's scale is applied by the step."""
-    adam = optax.adam(config.learning_rate, b1=config.beta1, b2=config.beta2)
+    """Return Adam or AdamW with clipping by the global norm; the schedule's scale is applied by the step."""
+    adam = optax.adamw(config.learning_rate, b1=config.beta1, b2=config.beta2, weight_decay=config.weight_decay)
+    if not config.weight_decay:
+        adam = optax.adam(config.learning_rate, b1=config.beta1, b2=config.beta2)
     return optax.chain(optax.clip_by_global_norm(config.gradient_clip), adam) if config.gradient_clip else adam
 
 
@@ -77,6 +79,13 @@ def make_plateau(config: TrainingConfig) -> optax.GradientTransformationExtraArg
     return reduce_on_plateau(
         factor=config.plateau_factor, patience=config.plateau_patience + 1, rtol=0.0, atol=config.plateau_threshold
     )
+
+
+def schedule_scale(config: TrainingConfig, plateau: ReduceLROnPlateauState, step: jax.Array) -> jax.Array:
+    """Return what the learning rate is multiplied by at `step`: the plateau's factor, or half a cosine from 1 to 0."""
+    if config.schedule == "plateau":
+        return plateau.scale
+    return optax.cosine_decay_schedule(1.0, config.epochs * config.steps_per_epoch)(step)
 
 
 def initial_variables(network: Network, config: Config) -> Any:

@@ -12,7 +12,11 @@ from mdnvo_jax import mixture
 from mdnvo_jax.config import Config
 from mdnvo_jax.model.head import Labels, mixture_from_outputs, regression_loss
 from mdnvo_jax.model.network import Network
-from mdnvo_jax.training.state import TRAIN_METRICS, Model, State, make_optimiser, make_plateau
+from mdnvo_jax.training.state import TRAIN_METRICS, Model, State, make_optimiser, make_plateau, schedule_scale
+
+# Pixels of the map of optical flow: longer flow is cut to this, and the loss is round below that.
+_LARGEST_FLOW = 8.0
+_FLOW_ROUNDING = 0.01
 
 Batch = dict[str, jax.Array]
 Metrics = dict[str, jax.Array]
@@ -27,6 +31,71 @@ def objective(
         return regression_loss(outputs, steps, labels, mask, config.training.kappa)
     predicted = mixture_from_outputs(outputs, labels, config.model)
     return mixture.nll(predicted, steps, mask=mask, coupling=config.model.coupling, reduction=reduction)
+
+
+def training_objective(
+    outputs: jax.Array, flow: jax.Array | None, batch: Batch, labels: Labels, config: Config
+) -> jax.Array:
+    """Return what a training step lowers: `objective`, or its beta-NLL, and the loss on optical flow."""
+    training = config.training
+    if training.beta and config.model.head == "mixture":
+        predicted = mixture_from_outputs(outputs, labels, config.model)
+        loss = beta_nll(predicted, batch["steps"], batch["mask"], labels, config.model.coupling, training.beta)
+    else:
+        loss = objective(outputs, batch, labels, config, training.reduction)
+    return loss if flow is None else loss + config.model.flow_weight * flow_loss(flow, batch["flow"])
+
+
+def beta_nll(
+    predicted: mixture.Mixture,
+    steps: jax.Array,
+    mask: jax.Array,
+    labels: Labels,
+    coupling: mixture.Coupling,
+    beta: float,
+) -> jax.Array:
+    """Return the beta-NLL, a mean over steps: each NLL times sigma^(2 beta), which has no gradient.
+
+    Sigma is that of the whole mixture over the deviation of the labels. For coupling "independent" each dimension's
+    NLL has its own weight; the NLL of a step of coupling "joint" has the geometric mean of the six. (Seitzer et al.
+    2022, equation 4, is this for one Gaussian.)
+
+    Args:
+      predicted: of each step, `[B, T, M, 6]`, m and rad.
+      steps: `[B, T, 6]`.
+      mask: `[B, T]`, true where a step counts.
+      labels: whose deviation is the unit of sigma.
+      coupling: of the mixture.
+      beta: 0 is the NLL; at 1 the gradient of a mean is that of the squared error.
+    """
+    weight = (mixture.variance(predicted) / labels.std**2) ** beta
+    if coupling == "joint":
+        weight = jnp.exp(jnp.mean(jnp.log(weight), axis=-1))
+        losses = mixture.nll(predicted, steps, mask=mask, coupling=coupling, reduction="none")
+    else:
+        # Each dimension as a mixture over one: `[B, T, 6, M, 1]`.
+        alone = mixture.Mixture(
+            logits=jnp.broadcast_to(predicted.logits[..., None, :], (*steps.shape, predicted.logits.shape[-1])),
+            mean=jnp.swapaxes(predicted.mean, -1, -2)[..., None],
+            log_scale=jnp.swapaxes(predicted.log_scale, -1, -2)[..., None],
+        )
+        counts = jnp.broadcast_to(mask[..., None], steps.shape)
+        losses = mixture.nll(alone, steps[..., None], mask=counts, coupling="independent", reduction="none")
+    return jnp.sum(jax.lax.stop_gradient(weight) * losses) / jnp.maximum(mask.sum(), 1)
+
+
+def flow_loss(predicted: jax.Array, flow: jax.Array) -> jax.Array:
+    """Return the mean length of the error of optical flow, in pixels of its map, where the flow is known.
+
+    Args:
+      predicted: `[..., 2]`.
+      flow: the same, NaN where it is not known.
+    """
+    known = jnp.isfinite(flow).all(-1)
+    # A flow of many pixels is that of the bonnet's edge: it shall not outweigh the rest.
+    error = predicted - jnp.where(known[..., None], jnp.clip(flow, -_LARGEST_FLOW, _LARGEST_FLOW), predicted)
+    length = jnp.sqrt(jnp.sum(error**2, -1) + _FLOW_ROUNDING**2)
+    return jnp.sum(length, where=known) / jnp.maximum(known.sum(), 1)
 
 
 def train_step(state: State, batch: Batch, *, network: Network, config: Config) -> tuple[State, Metrics]:
@@ -44,20 +113,21 @@ def train_step(state: State, batch: Batch, *, network: Network, config: Config) 
     model = state.model
 
     def loss_of(params: Any) -> tuple[jax.Array, tuple[jax.Array, Any]]:
-        outputs, updated = network.apply(
+        (outputs, flow), updated = network.apply(
             {"params": params, "batch_stats": model.batch_stats},
             batch["images"],
             batch["mask"],
             train=True,
             rngs={"dropout": jax.random.fold_in(state.rng, state.step)},
             mutable=["batch_stats"],
+            method="with_flow",
         )
-        loss = objective(outputs, batch, model.labels, config, config.training.reduction)
+        loss = training_objective(outputs, flow, batch, model.labels, config)
         return loss, (outputs, updated["batch_stats"])
 
     (loss, (outputs, batch_stats)), gradient = jax.value_and_grad(loss_of, has_aux=True)(model.params)
     update, optimiser = make_optimiser(config.training).update(gradient, state.optimiser, model.params)
-    update = optax.tree.scale(state.plateau.scale, update)
+    update = optax.tree.scale(schedule_scale(config.training, state.plateau, state.step), update)
     params = optax.apply_updates(model.params, update)
     norms = [optax.tree.norm(tree) for tree in (gradient, update, params)]
     predicted = mixture_from_outputs(outputs, model.labels, config.model, model.residual_scale)

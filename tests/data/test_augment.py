@@ -3,7 +3,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mdnvo_jax.data.augment import mirror_frame, photometric
+from mdnvo_jax.data.augment import mirror_flow, mirror_frame, narrow, photometric
 
 
 def blobs(camera, size, points):
@@ -97,3 +97,58 @@ def test_colours_are_toned_by_their_own_gain():
     frames = np.full((1, 30, 30, 3), 128, np.uint8)
     means = np.stack([draw(frames, seed).mean((0, 1, 2)) for seed in range(30)])
     assert 1 < (means - means.mean(1, keepdims=True)).std() < 15
+
+
+# Optical flow and narrower views
+
+
+def flow_field(camera, size, motion):
+    """Return the flow, in cells of 8 pixels, of a wall of uneven depth under a small motion (x, y, z) of the camera."""
+    fx, fy, cx, cy = (value / 8 for value in camera)
+    v, u = np.mgrid[: size[0], : size[1]].astype(float)
+    x, y = (u - cx) / fx, (v - cy) / fy
+    moved = np.stack([x - motion[0], y - motion[1], np.ones_like(x) - motion[2]])
+    return np.stack([fx * moved[0] / moved[2] + cx - u, fy * moved[1] / moved[2] + cy - v], -1)
+
+
+@pytest.mark.parametrize("cx", [44.0, 45.5, 42.2])
+def test_mirrored_flow_is_that_of_the_mirrored_motion(cx):
+    """A plane at depth 1: its flow is linear in the column, so blending two cells is exact."""
+    camera = (80.0, 80.0, cx, 20.0)
+    flow = flow_field(camera, (6, 12), (0.03, -0.01, 0.0))[None]
+    found = mirror_flow(flow, camera)
+    expected = flow_field(camera, (6, 12), (-0.03, -0.01, 0.0))[None]
+    known = np.isfinite(found).all(-1)
+    np.testing.assert_allclose(found[known], expected[known], atol=1e-12)
+    # Cells whose mirror is off the map know nothing; the others do.
+    mirror = 2 * cx / 8 - np.arange(12)
+    np.testing.assert_array_equal(known[0, 0], (mirror >= 0) & (mirror <= 11))
+
+
+def test_mirrored_flow_moves_with_the_column():
+    """Forward motion: flow points away from the middle on both sides, also after mirroring."""
+    camera = (80.0, 80.0, 40.0, 20.0)
+    flow = flow_field(camera, (6, 11), (0.01, 0, 0.1))[None]
+    found = mirror_flow(flow, camera)
+    np.testing.assert_allclose(found, flow_field(camera, (6, 11), (-0.01, 0, 0.1))[None], atol=1e-12)
+    flow[0, 2, 3] = np.nan
+    assert np.isnan(mirror_flow(flow, camera)[0, 2, 7]).all() and np.isnan(mirror_flow(flow, camera)).sum() == 2
+    assert np.isnan(mirror_flow(flow, None)).all()
+
+
+def test_a_narrower_view_repeats_its_edge_in_all_frames_alike():
+    frames = np.random.default_rng(0).integers(0, 256, (3, 40, 60, 1), dtype=np.uint8)
+    seen = []
+    for seed in range(40):
+        found = narrow(frames, np.random.default_rng(seed))
+        same = (found == frames).all((0, 3))
+        rows, columns = np.flatnonzero(same.any(1)), np.flatnonzero(same.any(0))
+        top, bottom, left, right = rows[0], rows[-1], columns[0], columns[-1]
+        np.testing.assert_array_equal(found, np.pad(
+            frames[:, top : bottom + 1, left : right + 1],
+            ((0, 0), (top, 39 - bottom), (left, 59 - right), (0, 0)),
+            mode="edge",
+        ))  # fmt: skip
+        seen.append((top, 39 - bottom, left, 59 - right))
+    # Up to 30 % above, 12 % below, 25 % on either side.
+    assert (np.max(seen, axis=0) <= (12, 5, 15, 15)).all() and (np.max(seen, axis=0) >= (8, 3, 10, 10)).all()

@@ -210,3 +210,21 @@ def test_an_output_that_cannot_be_written_is_named(sequences, image, tmp_path, m
 
 def test_sizes_as_text():
     assert [cache.megabytes(n) for n in (0, 1, 10**6, 1.5e9, 23e9)] == ["0 MB", "1 MB", "1 MB", "1.5 GB", "23.0 GB"]
+
+
+def test_optical_flow_is_kept_beside_the_frames(sequences, image, tmp_path):
+    rng = np.random.default_rng(0)
+    flow = rng.normal(size=(12, 3, 8, 2)).astype(np.float16).astype(np.float32)
+    flow[-1] = np.nan
+    source = dataclasses.replace(sequences[0], flow=lambda index: flow[index])
+    cache.prepare_cache([source, sequences[1]], image, tmp_path)
+    first, second = cache.read_cache(tmp_path, image)
+    assert second.flow is None
+    np.testing.assert_array_equal(np.stack([first.flow(index) for index in range(12)]), flow)
+    np.testing.assert_array_equal(first.subsequence(4, 9).flow(2), flow[6])
+    np.save(tmp_path / "00.flow.npy", flow[:5])
+    with pytest.raises(InputError, match=r"00.flow.npy has 5 frames, expected 12"):
+        cache.read_cache(tmp_path, image)
+    (tmp_path / "00.flow.npy").write_bytes(b"no array")
+    with pytest.raises(InputError, match=r"00.flow.npy is damaged"):
+        cache.read_cache(tmp_path, image)

@@ -1,8 +1,11 @@
+import dataclasses
+
 import numpy as np
 import pytest
 
 from mdnvo_jax.config import Config, DataConfig, ImageConfig
-from mdnvo_jax.data import cache, load
+from mdnvo_jax.data import cache, load, synthetic
+from mdnvo_jax.data.world.motion import draw_mount
 from mdnvo_jax.errors import InputError
 
 IMAGE = ImageConfig(height=20, width=62, channels=3)
@@ -109,3 +112,32 @@ def test_a_real_renderer_takes_what_is_asked_of_it():
     assert all(s.count == 5 and s.poses.shape == (5, 4, 4) for s in train + validation)
     labels = np.stack([s.steps() for s in train + validation])
     assert (labels[0] != labels[1]).any() and (labels[0] != labels[2]).any()
+
+
+def test_rendered_worlds_come_from_the_cache_and_are_scaled_to_the_height(tmp_path, monkeypatch):
+    camera = (31.0, 31.0, 30.5, 8.0)
+    config = config_of(
+        "",
+        ImageConfig(height=20, width=62, channels=1, camera=camera),
+        dataset="synthetic",
+        worlds=2,
+        world_frames=3,
+        validation_worlds=1,
+        camera_height_m=1.8,
+        camera_height_shares=(0.7, 1.2),
+    )
+    train, validation, image = load.load_split(config)
+    drives = [*train, *validation]
+    assert [drive.name for drive in drives] == ["world_000000", "world_000001", f"world_{load.VALIDATION_SEED}"]
+    raw = synthetic.drive(1, 3, height=20, width=62, camera=camera, camera_height_m=(1.26, 2.16))
+    height_m = draw_mount(1, (1.26, 2.16)).height_m
+    np.testing.assert_allclose(drives[1].poses[2, :3, 3], raw.poses[2, :3, 3] * 1.8 / height_m)
+    cache.prepare_cache(drives, image, tmp_path)
+    cached = load.load_split(dataclasses.replace(config, data=dataclasses.replace(config.data, cache=str(tmp_path))))
+    for drive, found in zip(drives, [*cached[0], *cached[1]], strict=True):
+        np.testing.assert_array_equal(found.poses, drive.poses)
+        np.testing.assert_array_equal(found.read(2), drive.read(2))
+        np.testing.assert_allclose(found.flow(1), drive.flow(1), rtol=1e-3, atol=1e-6)
+    more = dataclasses.replace(config, data=dataclasses.replace(config.data, cache=str(tmp_path), worlds=3))
+    with pytest.raises(InputError, match="no finished sequence world_000002"):
+        load.load_split(more)

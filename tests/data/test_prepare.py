@@ -127,3 +127,21 @@ def test_the_script_answers_help_quickly_and_mistakes_in_one_line(tmp_path):
     failed = run("--root", str(tmp_path), "--output", str(tmp_path / "c"))
     assert failed.returncode == 2 and failed.stderr.startswith("error: no poses/*.txt in")
     assert len(failed.stderr.splitlines()) == 1
+
+
+def test_rendered_worlds_are_prepared_with_their_flow(tmp_path, capsys):
+    config = tmp_path / "config.py"
+    config.write_text(
+        "from mdnvo_jax.config import *\n"
+        "config = Config(image=ImageConfig(20, 62, 1, camera=(31.0, 31.0, 30.5, 8.0)),\n"
+        "    data=DataConfig(dataset='synthetic', worlds=1, world_frames=3, validation_worlds=1))\n"
+    )
+    arguments = ["--config", str(config), "--dataset", "synthetic", "--output", str(tmp_path / "c")]
+    main(arguments)
+    assert "2 sequences, 6 frames as 62x20x1" in capsys.readouterr().out
+    flow = [s.flow(0).shape for s in cache.read_cache(tmp_path / "c", ImageConfig(20, 62, 1))]
+    assert flow == [(3, 8, 2), (3, 8, 2)]
+    with pytest.raises(InputError, match="takes its worlds from --config"):
+        main([*arguments, "--root", "there"])
+    with pytest.raises(InputError, match="--root is missing: give the folder of kitti"):
+        main(["--output", str(tmp_path / "d")])

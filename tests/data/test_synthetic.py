@@ -13,6 +13,7 @@ import pytest
 from mdnvo_jax import geometry
 from mdnvo_jax.data import images, synthetic
 from mdnvo_jax.data.world import film, render, trace, world
+from mdnvo_jax.data.world.motion import draw_mount
 from mdnvo_jax.errors import InputError
 
 # One size for all, so that everything is compiled once.
@@ -352,3 +353,24 @@ def test_classical_odometry_works_on_the_pictures(seed):
     error = there - here - flow[nearest[:, 1], nearest[:, 0]]
     assert np.abs(np.median(error, axis=0)).max() < 0.15
     assert np.quantile(np.linalg.norm(error, axis=1), 0.4) < 0.5
+
+
+def test_the_flow_for_training_is_that_of_every_eighth_pixel():
+    drive = synthetic.drive(3, FRAMES, **SIZE)
+    found, flow = drive.flow(12), synthetic.truth(3, FRAMES, 12, **SIZE).flow
+    assert found.shape == (HEIGHT // 8, WIDTH // 8, 2)
+    close = np.abs(8 * found - flow[::8, ::8]).max(-1) < 0.05
+    # At the edges of things the ray of the one may pass where that of the other does not.
+    assert close.mean() > 0.99
+
+
+def test_a_world_scaled_to_a_height_shows_the_same_frames():
+    """What one camera sees does not tell how large it is: metres are those of the height above the ground."""
+    heights = (1.2, 2.2)
+    plain = synthetic.drive(5, 4, **SIZE, camera_height_m=heights)
+    scaled = synthetic.drive(5, 4, **SIZE, camera_height_m=heights, scaled_to_height_m=1.65)
+    np.testing.assert_array_equal(plain.read(2), scaled.read(2))
+    factor = 1.65 / draw_mount(5, heights).height_m
+    assert abs(factor - 1) > 0.05
+    np.testing.assert_allclose(scaled.steps()[:, :3], factor * plain.steps()[:, :3], atol=1e-12)
+    np.testing.assert_allclose(scaled.steps()[:, 3:], plain.steps()[:, 3:], atol=1e-12)

@@ -7,8 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from mdnvo_jax.config import Config, DataConfig, ImageConfig, TrainingConfig
-from mdnvo_jax.data import windows
+from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig, TrainingConfig
+from mdnvo_jax.data import augment, windows
 from mdnvo_jax.data.sequence import Sequence
 from mdnvo_jax.errors import InputError
 
@@ -363,3 +363,42 @@ def test_real_windows(data_root):
     images = batch["images"].astype(float)
     near = np.abs(images[:, 1:] - images[:, :-1]).mean()
     assert near < 0.6 * np.abs(images[0] - images[1]).mean()
+
+
+# Optical flow
+
+
+def test_batches_carry_flow_where_the_model_asks_for_it(toy):
+    """Flow is known forwards at stride 1 alone; padding, other strides and windows played backwards have NaN."""
+    flow = np.random.default_rng(0).normal(size=(40, 1, 2, 2)).astype(np.float32)
+    sequence = dataclasses.replace(toy(40), flow=lambda index: flow[index], camera=(9.0, 9.0, 4.0, 4.0))
+    image = dataclasses.replace(IMAGE, camera=(9.0, 9.0, 4.0, 4.0))
+    config = config_of(image=image, window=4, shortest_window=2, strides=(1, 2), reverse=0.3)
+    config = dataclasses.replace(config, model=ModelConfig(flow_weight=1.0))
+    forwards = backwards = 0
+    for batch in taken(windows.training_batches([sequence, toy(40)], config, seed=0), 12):
+        assert batch["flow"].shape == (4, 4, 1, 2, 2) and batch["flow"].dtype == np.float32
+        assert np.isnan(batch["flow"][~batch["mask"]]).all()
+        for row, frames in enumerate(numbers(batch)):
+            steps = int(batch["mask"][row].sum())
+            found = batch["flow"][row, :steps]
+            if np.isfinite(found).all():
+                np.testing.assert_array_equal(found, flow[frames[:steps]])
+                forwards += 1
+            else:
+                assert np.isnan(found).all()
+                backwards += frames[0] > frames[1]
+    assert forwards > 5 and backwards > 5
+    plain = config_of(image=image, window=4)
+    assert "flow" not in taken(windows.training_batches([sequence], plain, seed=0), 1)[0]
+
+
+def test_mirrored_windows_have_mirrored_flow_and_narrow_ones_keep_it(toy):
+    camera = (9.0, 9.0, 4.0, 4.0)
+    flow = np.random.default_rng(0).normal(size=(40, 1, 2, 2)).astype(np.float32)
+    sequence = dataclasses.replace(toy(40), flow=lambda index: flow[index], camera=camera)
+    config = config_of(image=dataclasses.replace(IMAGE, camera=camera), window=4, mirror=1.0, narrow=1.0)
+    config = dataclasses.replace(config, model=ModelConfig(flow_weight=1.0))
+    batch = taken(windows.training_batches([sequence], config, seed=0), 1)[0]
+    for row, frames in enumerate(numbers(batch)):
+        np.testing.assert_array_equal(batch["flow"][row], augment.mirror_flow(flow[frames[:-1]], camera))

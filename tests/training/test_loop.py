@@ -185,3 +185,19 @@ def test_a_training_that_diverges_stops_and_keeps_its_last_checkpoint(config_fil
     np.testing.assert_array_equal(
         before.model.params["head"]["kernel"], last_state(tmp_path).model.params["head"]["kernel"]
     )
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--training.schedule", "cosine"], "set training.steps_per_epoch"),
+        (["--training.beta", "0.5"], "training.beta 0.5 with training.reduction sequence"),
+        (["--training.beta", "0.5", "--training.reduction", "mean", "--model.head", "regression"], "head mixture"),
+    ],
+)
+def test_choices_of_the_loss_that_contradict_each_other_are_refused(
+    config_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], options: list[str], message: str
+) -> None:
+    assert exit_code(train.main, [str(config_file), "--workdir", str(tmp_path / "w"), *options]) == 2
+    assert message in capsys.readouterr().err
+    assert not (tmp_path / "w").exists()

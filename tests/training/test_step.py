@@ -11,11 +11,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mdnvo_jax import mixture
 from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig, TrainingConfig
 from mdnvo_jax.model.head import Labels
 from mdnvo_jax.model.network import build
 from mdnvo_jax.training import step
-from mdnvo_jax.training.state import TRAIN_METRICS, State, initial_state, initial_variables, make_plateau
+from mdnvo_jax.training.state import (
+    TRAIN_METRICS,
+    State,
+    initial_state,
+    initial_variables,
+    make_optimiser,
+    make_plateau,
+    schedule_scale,
+)
 
 CONFIG = Config(
     image=ImageConfig(height=32, width=64, channels=1),
@@ -198,3 +207,99 @@ def test_two_devices_compute_what_one_computes(tmp_path: Path) -> None:
     assert "batch_size is 3: expected a multiple of the 2 devices" in str(found[1]["refused"])
     np.testing.assert_allclose(found[1]["losses"], found[0]["losses"], rtol=1e-4)
     np.testing.assert_allclose(found[1]["flat"], found[0]["flat"], rtol=1e-3, atol=1e-5)
+
+
+# What training may lower instead of the NLL
+
+
+def gaussians(sigma: np.ndarray, error: np.ndarray) -> mixture.Mixture:
+    """One Gaussian a step, its mean off the label 0 by `error`."""
+    return mixture.Mixture(jnp.zeros((*sigma.shape[:-1], 1)), error[..., None, :], jnp.log(sigma)[..., None, :])
+
+
+@pytest.mark.parametrize("coupling", ["independent", "joint"])
+def test_beta_nll_weights_each_gaussian_by_its_sigma(coupling: str) -> None:
+    generator = np.random.default_rng(0)
+    sigma, error = generator.uniform(0.1, 2, (2, 3, 6)), generator.normal(size=(2, 3, 6))
+    mask = np.array([[True, True, False], [True, False, True]])
+    unit = Labels(np.zeros(6), generator.uniform(0.5, 2, 6))
+    nll = 0.5 * (error / sigma) ** 2 + np.log(sigma) + 0.5 * np.log(2 * np.pi)
+    share = sigma / unit.std
+    for beta in (0.0, 0.5, 1.0):
+        if coupling == "joint":
+            expected = np.exp(2 * beta * np.log(share).mean(-1)) * nll.sum(-1)
+        else:
+            expected = (share ** (2 * beta) * nll).sum(-1)
+        found = step.beta_nll(gaussians(sigma, error), jnp.zeros((2, 3, 6)), jnp.asarray(mask), unit, coupling, beta)
+        np.testing.assert_allclose(found, expected[mask].mean(), rtol=1e-5)
+
+
+def test_at_beta_one_the_gradient_of_the_mean_is_that_of_the_squared_error() -> None:
+    generator = np.random.default_rng(1)
+    sigma, error = generator.uniform(0.1, 2, (1, 2, 6)), generator.normal(size=(1, 2, 6))
+    unit = Labels(np.zeros(6), np.ones(6))
+
+    def loss(error: jax.Array) -> jax.Array:
+        return step.beta_nll(
+            gaussians(sigma, error), jnp.zeros((1, 2, 6)), jnp.ones((1, 2), bool), unit, "independent", 1.0
+        )
+
+    np.testing.assert_allclose(jax.grad(loss)(jnp.asarray(error)), error / 2, rtol=1e-5)
+
+
+def test_the_loss_on_flow_is_the_mean_length_of_its_error_where_it_is_known() -> None:
+    flow = np.zeros((1, 2, 2, 3, 2), np.float32)
+    flow[0, 0] = np.nan
+    flow[0, 1, 0, 0] = (np.nan, 1)
+    flow[0, 1, 0, 1] = (30, -30)  # cut to 8 cells
+    found, gradient = jax.value_and_grad(step.flow_loss)(jnp.full(flow.shape, 3.0).at[..., 1].set(4.0), flow)
+    np.testing.assert_allclose(found, (4 * 5 + np.hypot(5, 12)) / 5, rtol=1e-4)
+    assert np.isfinite(gradient).all() and (gradient[0, 0] == 0).all() and (gradient[0, 1, 0, 0] == 0).all()
+    np.testing.assert_allclose(gradient[0, 1, 1, 0], np.array([0.6, 0.8]) / 5, rtol=1e-4)
+    assert step.flow_loss(jnp.zeros(flow.shape), np.full(flow.shape, np.nan)) == 0
+    # An exact flow is a minimum, not a kink without a gradient.
+    assert (jax.grad(step.flow_loss)(jnp.zeros(flow.shape), np.zeros(flow.shape)) == 0).all()
+
+
+def test_a_network_with_flow_learns_it_beside_the_steps_and_predicts_without_it() -> None:
+    config = with_(CONFIG, model={"flow_weight": 1.0}, training={"beta": 0.5, "reduction": "mean"})
+    network = build(config.image, config.model)
+    state = first_state(config)
+    batch = make_batch()
+    shade = batch["images"][:, 1:, ::8, ::8, 0] / 64.0
+    batch["flow"] = jnp.stack([shade, -shade], -1).at[0, 0].set(jnp.nan)
+    train_step = jax.jit(step.bind(step.train_step, network, config))
+
+    @jax.jit
+    def losses(state: State) -> jax.Array:
+        variables = {"params": state.model.params, "batch_stats": state.model.batch_stats}
+        outputs, flow = network.apply(
+            variables, batch["images"], batch["mask"], method="with_flow", train=True,
+            mutable=["batch_stats"], rngs={"dropout": jax.random.key(0)},
+        )[0]  # fmt: skip
+        assert flow.shape == batch["flow"].shape
+        return jnp.stack([step.objective(outputs, batch, LABELS, config, "mean"), step.flow_loss(flow, batch["flow"])])
+
+    before = losses(state)
+    for _ in range(30):
+        state, _ = train_step(state, batch)
+    after = losses(state)
+    # Both go down; the beta-NLL itself says little: its weights fall with sigma.
+    assert after[0] < before[0] - 1 and after[1] < 0.7 * before[1]
+    validated = step.bind(step.validation_step, network, config)(state.model, make_batch())
+    assert np.isfinite(validated["loss"])
+
+
+def test_the_cosine_ends_at_zero_after_all_steps() -> None:
+    config = TrainingConfig(schedule="cosine", epochs=4, steps_per_epoch=25)
+    plateau = make_plateau(config).init({"w": jnp.zeros(())})
+    scales = [float(schedule_scale(config, plateau, jnp.asarray(number))) for number in (0, 25, 50, 100, 120)]
+    np.testing.assert_allclose(scales, [1, (1 + np.sqrt(0.5)) / 2, 0.5, 0, 0], atol=1e-6)
+    assert float(schedule_scale(TrainingConfig(), plateau, jnp.asarray(99))) == 1
+
+
+def test_weight_decay_pulls_weights_to_zero_apart_from_the_gradient() -> None:
+    params = {"w": jnp.array([2.0, -4.0])}
+    optimiser = make_optimiser(TrainingConfig(weight_decay=0.1, learning_rate=0.5, gradient_clip=0))
+    update, _ = optimiser.update({"w": jnp.zeros(2)}, optimiser.init(params), params)
+    np.testing.assert_allclose(update["w"], -0.5 * 0.1 * params["w"])

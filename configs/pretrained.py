@@ -1,0 +1,47 @@
+"""The network whose weights ship with the package: trained on rendered drives alone.
+
+    bin/prepare_kitti --dataset synthetic --config configs/pretrained.py --output CACHE
+    python -m mdnvo_jax.train configs/pretrained.py --workdir runs/pretrained --data.cache CACHE
+    python -m mdnvo_jax.evaluate recalibrate --checkpoint runs/pretrained
+
+Frames of any camera with known intrinsics are brought to one virtual camera: 82 degrees across, as KITTI's, without the
+upper third of the sky. BENCHMARKS.md has what each choice was measured to be worth.
+"""
+
+from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig, TrainingConfig
+
+config = Config(
+    image=ImageConfig(
+        height=48,
+        width=192,
+        channels=1,
+        normalisation="local_contrast",
+        # The ground plane gives the scale, and its near part the most of it: KITTI's last row is kept, the sky is not.
+        camera=(111.2, 111.2, 95.5, 18.5),
+    ),
+    model=ModelConfig(
+        width=0.25, conv_dropout=0.0, lstm_hidden=128, lstm_layers=1, lstm_dropout=0.1, components=3, flow_weight=0.5
+    ),
+    data=DataConfig(
+        dataset="synthetic",
+        worlds=1000,
+        world_frames=100,
+        validation_worlds=40,
+        window=12,
+        hop=3,
+        mirror=0.5,
+        narrow=0.3,
+        camera_height_m=1.65,
+        camera_height_shares=(0.75, 1.3),
+    ),
+    training=TrainingConfig(
+        batch_size=8,
+        epochs=80,
+        steps_per_epoch=500,
+        schedule="cosine",
+        weight_decay=1e-2,
+        gradient_clip=1.0,
+        reduction="mean",
+        beta=0.5,
+    ),
+)
