@@ -24,7 +24,7 @@ config = Config(
     ),
     data=DataConfig(
         dataset="synthetic",
-        worlds=1000,
+        worlds=800,
         world_frames=100,
         validation_worlds=40,
         window=12,
@@ -36,8 +36,8 @@ config = Config(
     ),
     training=TrainingConfig(
         batch_size=8,
-        epochs=80,
-        steps_per_epoch=500,
+        epochs=20,
+        steps_per_epoch=450,
         schedule="cosine",
         weight_decay=1e-2,
         gradient_clip=1.0,

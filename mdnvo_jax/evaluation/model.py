@@ -12,15 +12,16 @@ import numpy as np
 from mdnvo_jax.baselines import constant
 from mdnvo_jax.errors import InputError
 from mdnvo_jax.evaluation import calibration_tables as tabled
-from mdnvo_jax.evaluation import scoring
+from mdnvo_jax.evaluation import drift, scoring
 from mdnvo_jax.evaluation.association import Paired
 from mdnvo_jax.evaluation.calibration import StepScores
 from mdnvo_jax.evaluation.calibration_tables import CalibrationRow
 from mdnvo_jax.evaluation.compare import CONSTANT, MeanStep, constant_score, true_steps
+from mdnvo_jax.evaluation.drift import Drift
 from mdnvo_jax.evaluation.formats import PoseFile
 from mdnvo_jax.evaluation.report import CalibrationPictures, PathPicture, Report, UncertaintyPicture
 from mdnvo_jax.evaluation.scoring import PathScore
-from mdnvo_jax.odometry import Trajectory
+from mdnvo_jax.odometry import Trajectory, trajectory
 
 if TYPE_CHECKING:
     from mdnvo_jax.config import Config
@@ -74,6 +75,7 @@ def evaluate(name: str, predicted: Many[Predicted], constant_step: MeanStep, *, 
       block: frames in a bootstrap block.
     """
     pairs = [_score(name, item, constant_step) for item in predicted]
+    drifts = [row for item in predicted for row in _drifts(name, item, constant_step)]
     rows: list[CalibrationRow] = []
     if len(predicted) > 1:
         for item in predicted:
@@ -86,10 +88,19 @@ def evaluate(name: str, predicted: Many[Predicted], constant_step: MeanStep, *, 
     entries = [entry for score, floor in pairs for entry in ((score, floor), (floor, None))]
     table, summaries = scoring.comparison("Pose error", entries, [f"{CONSTANT}: {constant_step.source}"], block=block)
     sequences = ", ".join(item.name for item in predicted)
+    calibrations = [tabled.calibration_data(row) for row in rows]
+    means = []
+    if len(predicted) > 1:
+        paths, scored = ([item for item in found if item["split"] != _ALL] for found in (summaries, calibrations))
+        means.append(drift.means_table(paths, scored, drifts))
     return Report(
-        [table, tabled.calibration_table(rows)],
+        [table, tabled.calibration_table(rows), drift.drift_table(drifts), *means],
         [*scoring.segment_tables(summaries), tabled.component_table(rows)],
-        {"paths": summaries, "calibration": [tabled.calibration_data(row) for row in rows]},
+        {
+            "paths": summaries,
+            "calibration": calibrations,
+            "drift": [{"name": of, "split": split, **vars(found)} for of, split, _, found in drifts],
+        },
         [
             PathPicture(
                 f"trajectory-{safe(item.name)}.png",
@@ -119,6 +130,14 @@ def _score(name: str, item: Predicted, constant_step: MeanStep) -> tuple[PathSco
     reference = PoseFile(item.name, "kitti", item.truth)
     floor = constant_score(constant_step, reference, item.name, "none", delta=1, unit="frames")
     return scoring.score_path(name, item.name, paired, "none"), floor
+
+
+def _drifts(name: str, item: Predicted, constant_step: MeanStep) -> list[tuple[str, str, int, Drift]]:
+    """Measure the drift of a prediction of one sequence, and of the constant predictor on it."""
+    steps = len(item.truth) - 1
+    floor = trajectory(constant.constant_mixture(constant_step.mean, constant_step.std, steps), coupling="independent")
+    paths = {name: item.trajectory, CONSTANT: floor}
+    return [(of, item.name, len(item.truth), drift.drift(path, item.truth)) for of, path in paths.items()]
 
 
 def track(chunks: Iterator[Any], total: int, *, name: str) -> Iterator[Any]:

@@ -51,12 +51,25 @@ def prediction(name, steps, sigma, seed):
 def test_each_sequence_and_all_of_them_have_rows_for_both_methods():
     items = [prediction(name, steps, 0.02, seed) for seed, (name, steps) in enumerate([("03", 150), ("a/05", 90)])]
     found = model.evaluate("model", items, MEAN_STEP, block=10)
-    errors, calibration = found.tables
+    errors, calibration, drifts, means = found.tables
     named = [(row["name"], row["split"]) for row in errors.rows]
     assert named == [(name, split) for split in ("03", "a/05", "all") for name in ("model", "constant predictor")]
     assert [(row["name"], row["split"]) for row in calibration.rows] == named
     assert errors.rows[4]["frames"] == "242 of 242" and calibration.rows[4]["frames"] == "242 of 242"
     assert errors.rows[4]["rmse"].value == pytest.approx(0.02 * np.sqrt(3), rel=0.15)
+    assert [(row["name"], row["split"]) for row in drifts.rows] == named[:4]
+    # Each sequence counts the same in the means, whatever its length.
+    assert means.rows[0]["sequences"] == "03 a/05" and means.rows[0]["frames"] == "151 91"
+    for key in ("rmse", "rotation"):
+        assert means.rows[0][key].value == pytest.approx((errors.rows[0][key].value + errors.rows[2][key].value) / 2)
+    biases = [abs(row["bias"].value) for row in drifts.rows]
+    assert means.rows[0]["bias"].value == pytest.approx(max(biases[0], biases[2]))
+    inside = [
+        [[share.value for share in found.results["calibration"][row]["coverage"]["3 sigma"].values()] for row in rows]
+        for rows in ((0, 2), (1, 3))
+    ]
+    for row, values in zip(means.rows, inside, strict=True):
+        assert row["inside"].value == pytest.approx(100 * np.mean(values, axis=0).min())
     assert found.results["calibration"][4]["steps"] == 240
     assert calibration.rows[4]["nees"].value == pytest.approx(6, abs=0.8)
     assert calibration.rows[4]["nll"].value < calibration.rows[5]["nll"].value
