@@ -12,7 +12,14 @@ config = Config(
         height=32, width=128, channels=1, normalisation="local_contrast", camera=(74.133, 74.133, 63.5, 12.167)
     ),
     model=ModelConfig(
-        width=0.125, conv_dropout=0.0, lstm_hidden=64, lstm_layers=1, lstm_dropout=0.1, components=3, flow_weight=0.5
+        width=0.125,
+        conv_dropout=0.0,
+        batch_norm_momentum=0.99,
+        lstm_hidden=64,
+        lstm_layers=1,
+        lstm_dropout=0.1,
+        components=3,
+        flow_weight=0.5,
     ),
     data=DataConfig(
         dataset="synthetic",

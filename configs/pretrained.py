@@ -20,7 +20,14 @@ config = Config(
         camera=(111.2, 111.2, 95.5, 18.5),
     ),
     model=ModelConfig(
-        width=0.25, conv_dropout=0.0, lstm_hidden=128, lstm_layers=1, lstm_dropout=0.1, components=3, flow_weight=0.5
+        width=0.25,
+        conv_dropout=0.0,
+        batch_norm_momentum=0.99,
+        lstm_hidden=128,
+        lstm_layers=1,
+        lstm_dropout=0.1,
+        components=3,
+        flow_weight=0.5,
     ),
     data=DataConfig(
         dataset="synthetic",

@@ -46,6 +46,9 @@ class ModelConfig:
     products: Literal["float32", "mixed"] = "float32"
     # Paper: dropout 0.1 on the convolutions.
     conv_dropout: float = 0.1
+    # Share of the running statistics of BatchNorm that a batch leaves. torch's default; with few windows a batch 0.99
+    # is steadier.
+    batch_norm_momentum: float = 0.9
     # Units a direction, and layers, of the LSTM. Not given in the paper; DeepVO has two layers of 1000.
     lstm_hidden: int = 1000
     lstm_layers: int = 2

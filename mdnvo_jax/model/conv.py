@@ -45,8 +45,7 @@ FLOW_STRIDE = 8
 
 # FlowNet's LeakyReLU; flax's own default is 0.01.
 LEAKY_SLOPE = 0.1
-# torch's defaults: running <- 0.9 running + 0.1 batch.
-BATCH_NORM_MOMENTUM = 0.9
+# torch's default.
 BATCH_NORM_EPSILON = 1e-5
 
 
@@ -96,6 +95,7 @@ class ConvBlock(nn.Module):
     channels: int
     dropout: float
     products: Products = "float32"
+    momentum: float = 0.9
 
     @nn.compact
     def __call__(self, x: Array, mask: Array, *, train: bool) -> Array:
@@ -113,18 +113,17 @@ class ConvBlock(nn.Module):
             batch = batch_moments(x, mask)
             filled = batch.pixels > 0
             unbiased = batch.variance * (batch.pixels / jnp.maximum(batch.pixels - 1, 1))
-            running_mean.value = jnp.where(filled, _blend(mean, batch.mean), mean)
-            running_variance.value = jnp.where(filled, _blend(variance, unbiased), variance)
+            running_mean.value = jnp.where(filled, self._blend(mean, batch.mean), mean)
+            running_variance.value = jnp.where(filled, self._blend(variance, unbiased), variance)
             mean = jnp.where(filled, batch.mean, mean)
             variance = jnp.where(filled, batch.variance, variance)
         x = (x - mean) * (scale * jax.lax.rsqrt(variance + BATCH_NORM_EPSILON)) + bias
         x = nn.leaky_relu(x, LEAKY_SLOPE)
         return drop(x, self.dropout, self.make_rng("dropout")) if train and self.dropout else x
 
-
-def _blend(running: Array, batch: Array) -> Array:
-    """Return the running statistic after one more batch."""
-    return (BATCH_NORM_MOMENTUM * running + (1 - BATCH_NORM_MOMENTUM) * batch).astype(running.dtype)
+    def _blend(self, running: Array, batch: Array) -> Array:
+        """Return the running statistic after one more batch."""
+        return (self.momentum * running + (1 - self.momentum) * batch).astype(running.dtype)
 
 
 class ConvStack(nn.Module):
@@ -133,6 +132,7 @@ class ConvStack(nn.Module):
     multiplier: float
     dropout: float
     products: Products = "float32"
+    momentum: float = 0.9
 
     def __call__(self, pairs: Array, mask: Array, *, train: bool) -> Array:
         """Return the last of `maps`: `[N, h, w, D]` with h, w of `map_size` and D = 1024 * multiplier."""
@@ -153,7 +153,7 @@ class ConvStack(nn.Module):
         maps = []
         for layer in LAYERS:
             channels = layer_channels(layer, self.multiplier)
-            block = ConvBlock(layer, channels, self.dropout, self.products, name=layer.name)
+            block = ConvBlock(layer, channels, self.dropout, self.products, self.momentum, name=layer.name)
             pairs = block(pairs, mask, train=train)
             maps.append(pairs)
         return tuple(maps)

@@ -29,7 +29,7 @@ class Network(nn.Module):
     def setup(self) -> None:
         """Declare the three parts."""
         config = self.model_config
-        self.stack = ConvStack(config.width, config.conv_dropout, config.products)
+        self.stack = ConvStack(config.width, config.conv_dropout, config.products, config.batch_norm_momentum)
         self.lstm: LstmParams = self.param(
             "lstm",
             functools.partial(

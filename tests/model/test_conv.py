@@ -226,3 +226,16 @@ def test_dropout_acts_in_training_only(block):
     assert abs(dropped.mean() - 0.1) < 4 * np.sqrt(0.09 / dropped.size)
     np.testing.assert_allclose(runs[0][~dropped], np.asarray(kept)[~dropped] / 0.9, rtol=1e-5)
     assert (runs[1] != runs[0]).any()
+
+
+def test_the_momentum_is_the_share_of_the_statistics_that_a_batch_leaves():
+    pairs = np.random.default_rng(0).normal(size=(3, 16, 16, 2)).astype(np.float32)
+    mask = np.ones(3, bool)
+    kept = {}
+    for momentum in (0.9, 0.99):
+        stack = ConvStack(1 / 64, 0.0, momentum=momentum)
+        variables = stack.init(jax.random.key(0), pairs, mask, train=False)
+        _, updated = stack.apply(variables, pairs, mask, train=True, mutable=["batch_stats"])
+        kept[momentum] = updated["batch_stats"]["conv1"]["mean"]
+    # The mean starts at zero: what a batch adds is in proportion to one less the momentum.
+    np.testing.assert_allclose(kept[0.9], 10 * kept[0.99], rtol=1e-5)
