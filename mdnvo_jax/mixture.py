@@ -64,7 +64,11 @@ def log_prob(mixture: Mixture, value: ArrayLike, *, coupling: Coupling = "indepe
       ValueError: shapes disagree, or `coupling` is unknown.
     """
     mixture, value = _checked_with(mixture, value)
-    return jax.nn.logsumexp(_log_terms(mixture, value, coupling), axis=-2).sum(-1)
+    log_terms = _log_terms(mixture, value, coupling)
+    if coupling == "joint":
+        # On a processor XLA copies arrays whose last axis is one long.
+        return jax.nn.logsumexp(log_terms[..., 0], axis=-1)
+    return jax.nn.logsumexp(log_terms, axis=-2).sum(-1)
 
 
 def nll(
@@ -345,7 +349,19 @@ def _log_terms(mixture: Mixture, value: Array, coupling: str) -> Array:
     _check_coupling(coupling)
     residual = (value[..., None, :] - mixture.mean) * jnp.exp(-mixture.log_scale)
     log_normal = _log_normal(residual, mixture.log_scale)
-    return _log_weights(mixture) + (log_normal.sum(-1, keepdims=True) if coupling == "joint" else log_normal)
+    return _log_weights(mixture) + (_sum_dimensions(log_normal)[..., None] if coupling == "joint" else log_normal)
+
+
+def _sum_dimensions(terms: Array) -> Array:
+    """Sum over the last axis; on a processor as a product with ones, which XLA computes in half the time.
+
+    Not elsewhere: a TPU rounds the factors of a product, and its exact product makes NaN of an infinite factor.
+    """
+
+    def product(terms: Array) -> Array:
+        return jnp.dot(terms, jnp.ones(terms.shape[-1], terms.dtype), precision="highest")
+
+    return jax.lax.platform_dependent(terms, cpu=product, default=lambda terms: terms.sum(-1))
 
 
 def _log_normal(residual: Array, log_scale: Array) -> Array:

@@ -267,8 +267,9 @@ def test_reductions(x64: None) -> None:
     np.testing.assert_allclose(nll(mixture, value, coupling="joint"), -joint.mean(), rtol=1e-12)
 
 
+@pytest.mark.parametrize("coupling", COUPLINGS)
 @pytest.mark.parametrize("reduction", ["mean", "sequence", "none"])
-def test_masked_steps_count_for_nothing(reduction: str, x64: None) -> None:
+def test_masked_steps_count_for_nothing(reduction: str, coupling: str, x64: None) -> None:
     """Whatever a masked step holds, NaN included, the loss is that of the steps that are left, and so is its slope."""
     mixture, value = random_mixture(), random_value()
     mask = np.array([[True, False, True], [False, False, False]])
@@ -276,11 +277,11 @@ def test_masked_steps_count_for_nothing(reduction: str, x64: None) -> None:
     dirty_value = np.where(mask[..., None], value, np.inf)
 
     def loss(mixture: Mixture, value: jax.Array) -> jax.Array:
-        return nll(mixture, value, mask=mask, reduction=reduction).sum()
+        return nll(mixture, value, mask=mask, reduction=reduction, coupling=coupling).sum()
 
     def loss_of_the_rest(mixture: Mixture, value: jax.Array) -> jax.Array:
         kept = Mixture(*(field[0, ::2] for field in mixture))
-        return nll(kept, value[0, ::2], reduction=reduction).sum()
+        return nll(kept, value[0, ::2], reduction=reduction, coupling=coupling).sum()
 
     found, found_slope = jax.jit(jax.value_and_grad(loss, argnums=(0, 1)))(device(dirty), jnp.asarray(dirty_value))
     expected, slope = jax.jit(jax.value_and_grad(loss_of_the_rest, argnums=(0, 1)))(device(mixture), jnp.asarray(value))
@@ -404,6 +405,60 @@ def test_gradients_against_finite_differences(x64: None) -> None:
         leaves = map(jax.tree.leaves, (slopes[name], ahead[name], behind[name]))
         for slope, up, down in zip(*leaves, strict=True):
             np.testing.assert_allclose(slope, (up - down) / (2 * step), rtol=1e-6, atol=1e-6, err_msg=name)
+
+
+def plain_joint(mixture: Mixture, value: jax.Array) -> jax.Array:
+    """The definition, differentiated by JAX alone."""
+    squares = ((value[..., None, :] - mixture.mean) / jnp.exp(mixture.log_scale)) ** 2
+    log_normal = -0.5 * (squares + np.log(2 * np.pi)) - mixture.log_scale
+    return jax.nn.logsumexp(jax.nn.log_softmax(mixture.logits) + log_normal.sum(-1), axis=-1)
+
+
+def test_slopes_of_the_joint_density_are_those_of_its_definition(x64: None) -> None:
+    """In both modes, once and twice, under vmap."""
+    mixture, value = device(random_mixture()), jnp.asarray(random_value())
+    direction = (device(random_mixture(8)), jnp.asarray(random_value(9)))
+
+    def slopes(density: Callable) -> list[jax.Array]:
+        def total(*point: object) -> jax.Array:
+            return jnp.sin(density(*point)).sum()
+
+        reverse = jax.grad(total, argnums=(0, 1))
+        forward_of_reverse = jax.jvp(reverse, (mixture, value), direction)
+        mapped = jax.vmap(jax.vmap(jax.grad(density, argnums=(0, 1))))(mixture, value)
+        return jax.tree.leaves((jax.jvp(density, (mixture, value), direction), forward_of_reverse, mapped))
+
+    found = jax.jit(lambda: slopes(partial(mx.log_prob, coupling="joint")))()
+    for ours, exact in zip(found, jax.jit(lambda: slopes(plain_joint))(), strict=True):
+        np.testing.assert_allclose(ours, exact, rtol=1e-10, atol=1e-12)
+
+
+def test_slope_beyond_the_largest_square_is_finite() -> None:
+    """1e25 sigma from a component: the square of the residual is infinite, the weight of the component zero."""
+    mixture = Mixture(jnp.zeros(2), jnp.array([[0.0, 0.0], [1e25, 0.0]]), jnp.zeros((2, 2)))
+    value = jnp.array([0.5, 0.0])
+    found = jax.jit(jax.grad(lambda m, y: mx.nll(m, y, coupling="joint"), argnums=(0, 1)))(mixture, value)
+    np.testing.assert_allclose(found[0].mean, [[-0.5, 0], [0, 0]])
+    np.testing.assert_allclose(found[0].log_scale, [[0.75, 1], [0, 0]])
+    np.testing.assert_allclose(found[1], [0.5, 0])
+
+
+@pytest.mark.parametrize("platform", ["cpu", "cuda", "tpu"])
+def test_only_a_processor_adds_up_dimensions_by_a_product(platform: str) -> None:
+    """A TPU would round it, or make NaN of an infinite term; nor is there a product in the gradient."""
+    loss = jax.jit(jax.value_and_grad(partial(mx.nll, coupling="joint"), argnums=(0, 1)))
+    lowered = loss.trace(GOOD, GOOD_VALUE).lower(lowering_platforms=(platform,))
+    assert ("dot_general" in lowered.as_text()) == (platform == "cpu")
+
+
+@pytest.mark.parametrize("compiled", [True, False], ids=["jit", "eager"])
+def test_an_infinite_residual_has_density_zero(compiled: bool) -> None:
+    density = partial(mx.log_prob, coupling="joint")
+    density = jax.jit(density) if compiled else density
+    far = GOOD_VALUE.at[0, 0, 0].set(jnp.inf).at[1, 2, 1].set(-jnp.inf)
+    expected = np.asarray(log_prob(GOOD, GOOD_VALUE, coupling="joint")).copy()
+    expected[0, 0] = expected[1, 2] = -np.inf
+    np.testing.assert_allclose(density(GOOD, far), expected, rtol=1e-6)
 
 
 def test_slope_of_the_quantile_is_one_over_the_density(x64: None) -> None:
