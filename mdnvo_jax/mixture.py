@@ -16,8 +16,10 @@ Both have the same marginals, so `mean`, `variance`, `cdf`, `quantile`, `interva
 >>> import jax.numpy as jnp
 >>> from mdnvo_jax import mixture
 >>> two = mixture.Mixture(jnp.log(jnp.array([0.25, 0.75])), jnp.array([[-1.0], [1.0]]), jnp.zeros((2, 1)))
->>> [round(float(x), 4) for x in (mixture.mean(two)[0], mixture.variance(two)[0], mixture.nll(two, jnp.zeros(1)))]
-[0.5, 1.75, 1.4189]
+>>> round(float(mixture.mean(two)[0]), 4), round(float(mixture.variance(two)[0]), 4)
+(0.5, 1.75)
+>>> round(float(mixture.nll(two, jnp.array([0.0]))), 4)
+1.4189
 >>> [round(float(end[0]), 2) for end in mixture.interval(two, 0.9)]
 [-1.86, 2.5]
 """
@@ -178,7 +180,7 @@ def cdf(mixture: Mixture, value: ArrayLike) -> Array:
     Within [0, 1], and of full relative precision in the lower tail. `value` and what it raises as in `log_prob`.
     """
     mixture, value = _checked_with(mixture, value)
-    residual, weights = (value[..., None, :] - mixture.mean) * jnp.exp(-mixture.log_scale), _weights(mixture)
+    residual, weights = _residual(mixture, value), _weights(mixture)
     below, above = (weights * ndtr(residual)).sum(-2), (weights * ndtr(-residual)).sum(-2)
     # The two sum to one but for rounding; dividing keeps a probability from exceeding one.
     return below / (below + above)
@@ -220,8 +222,11 @@ def sample(mixture: Mixture, key: Array, shape: tuple[int, ...] = (), *, couplin
     choice_key, noise_key = jax.random.split(key)
     index_shape = (*shape, *batch, dimensions if coupling == "independent" else 1)
     index = jax.random.categorical(choice_key, mixture.logits[..., None, :], shape=index_shape)
-    fields = (field[(None,) * len(shape)] for field in (mixture.mean, mixture.log_scale))
-    centre, log_scale = (jnp.take_along_axis(field, index[..., None, :], axis=-2)[..., 0, :] for field in fields)
+    in_front = (None,) * len(shape)
+    centre, log_scale = (
+        jnp.take_along_axis(field[in_front], index[..., None, :], axis=-2)[..., 0, :]
+        for field in (mixture.mean, mixture.log_scale)
+    )
     return centre + jnp.exp(log_scale) * jax.random.normal(noise_key, centre.shape, centre.dtype)
 
 
@@ -243,10 +248,11 @@ def widen(mixture: Mixture, factor: ArrayLike) -> Mixture:
     """Distribution of `mean + factor * (y - mean)`: `mixture` about its own mean, `factor` `[K]` times as wide.
 
     Means of components move with their widths, so that the mean and the shape stay and every standard deviation and
-    interval is multiplied. ValueError where `factor` is no `[K]` or not positive.
+    interval is multiplied. ValueError where `factor` is not `[K]`, or not positive.
     """
     mixture, factor = _checked(mixture), _float(factor)
-    if factor.shape != (expected := mixture.mean.shape[-1:]):
+    expected = mixture.mean.shape[-1:]
+    if factor.shape != expected:
         raise ValueError(f"factor has shape {factor.shape}; expected {expected}, K of the mixture")
     _check_positive(factor, "factor")
     centre = mean(mixture)[..., None, :]
@@ -256,8 +262,9 @@ def widen(mixture: Mixture, factor: ArrayLike) -> Mixture:
 def crps(mixture: Mixture, value: ArrayLike) -> Array:
     """Continuous ranked probability score, by dimension: E|X - y| - E|X - X'| / 2, in the units of the dimension.
 
-    Integral of (F(x) - 1{y <= x})^2; less is better; of a point forecast, the absolute error. In closed form: Grimit,
-    Gneiting, Berrocal and Johnson, Q. J. R. Meteorol. Soc. 132, 2006. `value` and what it raises as in `log_prob`.
+    The integral of (F(x) - 1{y <= x})^2; less is better, and of a point forecast it is the absolute error. Closed form
+    for Gaussian mixtures: Grimit, Gneiting, Berrocal and Johnson, Q. J. R. Meteorol. Soc. 132, 2006. `value` and what
+    it raises as in `log_prob`.
     """
     mixture, value = _checked_with(mixture, value)
     weights = _weights(mixture)
@@ -309,7 +316,8 @@ def _float(array: ArrayLike, *partners: Array) -> Array:
 
 
 def _checked(mixture: Mixture) -> Mixture:
-    mixture = Mixture(*(_float(field, *map(jnp.asarray, mixture)) for field in mixture))
+    fields = [jnp.asarray(field) for field in mixture]
+    mixture = Mixture(*(_float(field, *fields) for field in fields))
     logits, centre, log_scale = map(jnp.shape, mixture)
     if not logits or centre[:-1] != logits or log_scale != centre:
         raise ValueError(f"mixture has shapes {logits}, {centre}, {log_scale}; expected [..., M], [..., M, K] twice")
@@ -344,11 +352,14 @@ def _log_weights(mixture: Mixture) -> Array:
     return jax.nn.log_softmax(mixture.logits, axis=-1)[..., None]
 
 
+def _residual(mixture: Mixture, value: Array) -> Array:
+    return (value[..., None, :] - mixture.mean) * jnp.exp(-mixture.log_scale)
+
+
 def _log_terms(mixture: Mixture, value: Array, coupling: str) -> Array:
     """log(alpha_i N_i(value)): `[..., M, K]` where dimensions are independent, `[..., M, 1]` where they are joint."""
     _check_coupling(coupling)
-    residual = (value[..., None, :] - mixture.mean) * jnp.exp(-mixture.log_scale)
-    log_normal = _log_normal(residual, mixture.log_scale)
+    log_normal = _log_normal(_residual(mixture, value), mixture.log_scale)
     return _log_weights(mixture) + (_sum_dimensions(log_normal)[..., None] if coupling == "joint" else log_normal)
 
 
@@ -406,7 +417,8 @@ def _lower_quantile(log_weight: Array, centre: Array, log_scale: Array, tail: Ar
 @_lower_quantile.defjvp
 def _lower_quantile_jvp(primals: tuple[Array, ...], tangents: tuple[Array, ...]) -> tuple[Array, Array]:
     point = _lower_quantile(*primals)
-    (log_weight, centre, log_scale, _), (d_log_weight, d_centre, d_log_scale, d_tail) = primals, tangents
+    log_weight, centre, log_scale, _ = primals
+    d_log_weight, d_centre, d_log_scale, d_tail = tangents
     from_centre = point[..., None, :] - centre
     residual = from_centre * jnp.exp(-log_scale)
     log_terms = log_weight + _log_normal(residual, log_scale)
