@@ -10,57 +10,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import small_model
+from small_model import CONFIG, LABELS
 
 from mdnvo_jax import mixture, predictor
-from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig
 from mdnvo_jax.errors import InputError
 from mdnvo_jax.mixture import Mixture
-from mdnvo_jax.model.head import Labels, mixture_from_outputs
+from mdnvo_jax.model.head import mixture_from_outputs
 from mdnvo_jax.model.network import build
 from mdnvo_jax.training import checkpoint
 from mdnvo_jax.training.state import initial_state, initial_variables
 
-CONFIG = Config(
-    image=ImageConfig(height=32, width=64, channels=1, camera=(40.0, 40.0, 31.5, 15.5)),
-    model=ModelConfig(width=1 / 16, lstm_hidden=8, lstm_layers=1, components=2),
-    data=DataConfig(window=4),
-)
-LABELS = Labels(np.array([0, 0, 1, 0, 0.01, 0]), np.array([0.02, 0.02, 0.5, 0.005, 0.02, 0.005]))
-FRAMES = np.stack(
-    [
-        cv2.resize(np.random.default_rng(seed).integers(0, 256, (4 + seed, 8, 1), dtype=np.uint8), (64, 32))[..., None]
-        for seed in range(12)
-    ]
-)
+FRAMES = small_model.FRAMES[:12]
 
 
 @pytest.fixture(scope="module")
 def workdir(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An untrained model, saved as a training would.
-
-    Its batch statistics are those of the frames and its head is loud, so that what it sees matters to what it says.
-    """
-    folder = tmp_path_factory.mktemp("model")
-    network = build(CONFIG.image, CONFIG.model)
-    state = initial_state(initial_variables(network, CONFIG), CONFIG, LABELS)
-
-    @jax.jit
-    def look(batch_stats: object) -> object:
-        variables = {"params": state.model.params, "batch_stats": batch_stats}
-        windows = jnp.stack([FRAMES[:5], FRAMES[4:9], FRAMES[7:12]])
-        keys = {"dropout": jax.random.PRNGKey(0)}
-        mask = jnp.ones((3, 4), bool)
-        return network.apply(variables, windows, mask, train=True, rngs=keys, mutable=["batch_stats"])[1]["batch_stats"]
-
-    batch_stats = state.model.batch_stats
-    for _ in range(30):
-        batch_stats = look(batch_stats)
-    params = {**state.model.params, "head": jax.tree.map(lambda leaf: 5 * leaf, state.model.params["head"])}
-    state = state._replace(model=state.model._replace(params=params, batch_stats=batch_stats))
-    store = checkpoint.Store(folder, keep_latest=2)
-    store.save(state, None, CONFIG, 1.0)
-    store.close()
-    return folder
+    return small_model.save(tmp_path_factory.mktemp("model"))
 
 
 @pytest.fixture(scope="module")
