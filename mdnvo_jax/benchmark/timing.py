@@ -2,7 +2,7 @@
 
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -78,6 +78,11 @@ def spread(values: Sequence[float], scale: float = 1.0) -> Value:
 def rate(values: Sequence[float], count: float) -> Value:
     """Return how many of `count` things a second were done in rounds that took `values` seconds."""
     return spread([count / value for value in values])
+
+
+def fastest(times: Mapping[str, Sequence[float]], names: Iterable[str]) -> str:
+    """Return which of `names` took the least time by the median."""
+    return min(names, key=lambda name: float(np.median(times[name])))
 
 
 def ratio(peer: Sequence[float], ours: Sequence[float]) -> Value:

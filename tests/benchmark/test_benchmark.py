@@ -58,6 +58,8 @@ def test_ratios_are_medians_over_rounds_of_the_peer_over_ours() -> None:
     # The ratio of the medians would be another.
     assert timing.ratio([1.0, 10.0, 12.0], [4.0, 2.0, 3.0]).value == 4.0
     assert timing.rate([0.5, 0.25, 1.0], count=10).value == 20.0
+    # Neither by the best round nor by the mean, and of those asked for.
+    assert timing.fastest({"a": [1.0, 5.0, 5.0], "b": [2.0, 3.0, 99.0], "c": [0.0] * 3}, ["a", "b"]) == "b"
     assert timing.spread([1.0, 2.0, 3.0, 4.0, 5.0], 1e3) == Value(3000.0, low=2000.0, high=4000.0)
     with pytest.raises(ValueError, match="zip"):
         timing.ratio([1.0, 2.0], [1.0])

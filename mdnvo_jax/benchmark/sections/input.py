@@ -13,7 +13,7 @@ from mdnvo_jax import geometry
 from mdnvo_jax.benchmark import material, peers
 from mdnvo_jax.benchmark.agreement import DisagreementError
 from mdnvo_jax.benchmark.outcome import Outcome, Settings, compared
-from mdnvo_jax.benchmark.timing import Contender, Untimed, interleaved, ratio, spread
+from mdnvo_jax.benchmark.timing import Contender, Untimed, fastest, interleaved, ratio, spread
 from mdnvo_jax.config import Config
 from mdnvo_jax.data.cache import prepare_cache, read_cache
 from mdnvo_jax.data.folder import read_frames
@@ -104,8 +104,8 @@ def _loading(config: Config, sources: dict[str, _Source], folder: Path, settings
     outcome.times("input, a batch", found)
     loaders = [name for name in found if name.startswith(LOADER)]
     if loaders:
-        fastest = min(loaders, key=lambda name: float(np.median(found[name])))
-        outcome.target("input", fastest, ratio(found[fastest], found[CACHE]))
+        loader = fastest(found, loaders)
+        outcome.target("input", loader, ratio(found[loader], found[CACHE]))
     frames_in_batch = batch * (window + 1)
     return Table(
         title=f"Input of training: batches of {batch} x {window + 1} frames of {config.image.width}x"

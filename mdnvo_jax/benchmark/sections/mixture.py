@@ -10,7 +10,7 @@ from mdnvo_jax import mixture
 from mdnvo_jax.benchmark import peers
 from mdnvo_jax.benchmark.agreement import agree
 from mdnvo_jax.benchmark.outcome import Outcome, Settings, compared
-from mdnvo_jax.benchmark.timing import Contender, interleaved, ratio
+from mdnvo_jax.benchmark.timing import Contender, fastest, interleaved, ratio
 from mdnvo_jax.evaluation.tables import Column, Row, Table
 from mdnvo_jax.mixture import Mixture
 
@@ -78,8 +78,8 @@ def _one(count: int, components: int, found: list[str], settings: Settings, outc
     outcome.times(f"mixture {size}", times)
     rivals = [name for name in (TORCH, NUMPYRO) if name in times]
     if rivals:
-        fastest = min(rivals, key=lambda name: float(np.median(times[name])))
-        outcome.target("mixture", f"{size}, {fastest}", ratio(times[fastest], times[OURS]))
+        rival = fastest(times, rivals)
+        outcome.target("mixture", f"{size}, {rival}", ratio(times[rival], times[OURS]))
     return [{"size": size, **compared(name, times, OURS)} for name in contenders]
 
 

@@ -12,7 +12,7 @@ from mdnvo_jax.benchmark import contest, material
 from mdnvo_jax.benchmark.agreement import agree
 from mdnvo_jax.benchmark.contest import CACHING, OURS, RECOMPUTING, Contest
 from mdnvo_jax.benchmark.outcome import Outcome, Settings, compared
-from mdnvo_jax.benchmark.timing import Contender, interleaved, rate, ratio
+from mdnvo_jax.benchmark.timing import Contender, fastest, interleaved, rate, ratio
 from mdnvo_jax.config import Config
 from mdnvo_jax.data.images import prepare
 from mdnvo_jax.evaluation.tables import Column, Row, Table, Value
@@ -66,10 +66,6 @@ def _rows(size: str, found: Mapping[str, Sequence[float]], frames: int) -> list[
     return [{"size": size, **compared(name, found, OURS), "rate": rate(found[name], frames)} for name in found]
 
 
-def _fastest(found: Mapping[str, Sequence[float]], names: Sequence[str]) -> str:
-    return min(names, key=lambda name: float(np.median(found[name])))
-
-
 def _decoded(entered: Contest, settings: Settings, outcome: Outcome) -> list[Row]:
     """Return rows of frames a second from decoded frames."""
     size = entered.size
@@ -77,9 +73,9 @@ def _decoded(entered: Contest, settings: Settings, outcome: Outcome) -> list[Row
     found = interleaved(entered.decoded(outcome), settings.rounds(_ROUNDS), warm_up=0, budget_s=_BUDGET_S)
     outcome.times(f"predict {size}, decoded", found)
     if entered.twins:
-        best = _fastest(found, list(entered.ours))
+        best = fastest(found, entered.ours)
         cached = CACHING + "float32"
-        halved = _fastest(found, [CACHING + precision for precision in entered.twins if precision != "float32"])
+        halved = fastest(found, [CACHING + precision for precision in entered.twins if precision != "float32"])
         outcome.target("predict deepvo", size, ratio(found[RECOMPUTING + "float32"], found[OURS]))
         outcome.target("predict float32", size, ratio(found[cached], found[OURS]))
         outcome.target("predict best", f"{size}: {best}", ratio(found[cached], found[best]))
@@ -93,7 +89,7 @@ def _from_disk(entered: Contest, case: _Case, settings: Settings, outcome: Outco
     found = interleaved(entered.from_disk() | live, settings.rounds(_ROUNDS), budget_s=_BUDGET_S / 3)
     outcome.times(f"predict {entered.size}, from disk", found)
     if live:
-        best = _fastest(found, list(live))
+        best = fastest(found, live)
         outcome.target("live", best, rate(found[best], case.frames))
     return _rows(entered.size, found, case.frames)
 
