@@ -8,13 +8,14 @@ import cv2
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig, TrainingConfig
 from mdnvo_jax.data.sequence import Sequence
 from mdnvo_jax.model.head import Labels
 from mdnvo_jax.model.network import Network, Variables, build, template
-from mdnvo_jax.training import checkpoint
-from mdnvo_jax.training.state import Model, initial_state
+from mdnvo_jax.training import checkpoint, parallel
+from mdnvo_jax.training.state import Model, State, initial_state
 
 # Rows and columns of KITTI's frames.
 KITTI_SIZE = (376, 1241)
@@ -130,6 +131,12 @@ def fresh_variables(network: Network, config: Config) -> Variables:
         return jnp.asarray((2 * rng.random(leaf.shape, np.float32) - 1) * np.float32(limit))
 
     return jax.tree.map_with_path(draw, template(network, config.image, config.data.window))
+
+
+def fresh_state(config: Config, mesh: Mesh) -> State:
+    """Return the state before the first step of training, on all devices of `mesh`."""
+    variables = fresh_variables(build(config.image, config.model), config)
+    return jax.device_put(initial_state(variables, config, LABELS), parallel.replicated(mesh))
 
 
 def untrained_model(config: Config) -> Model:

@@ -21,7 +21,6 @@ from mdnvo_jax.mixture import Mixture
 from mdnvo_jax.model.network import build
 from mdnvo_jax.predictor import Predictor
 from mdnvo_jax.training import parallel, step
-from mdnvo_jax.training.state import initial_state
 
 _ROUNDS = 7
 _MULTIPLIER = 0.25
@@ -120,8 +119,7 @@ def _training(config: Config, steps: int, devices: int) -> Contender:
     network = build(config.image, config.model)
     take = parallel.compile_step(step.bind(step.train_step, network, config), mesh, donate=True)
     batch = parallel.place(material.training_batch(config), mesh)
-    fresh = initial_state(material.fresh_variables(network, config), config, material.LABELS)
-    state = jax.device_put(fresh, parallel.replicated(mesh))
+    state = material.fresh_state(config, mesh)
 
     def run() -> Any:
         nonlocal state

@@ -22,7 +22,6 @@ from mdnvo_jax.data.windows import training_batches
 from mdnvo_jax.evaluation.tables import Column, Table
 from mdnvo_jax.model.network import build
 from mdnvo_jax.training import parallel, step
-from mdnvo_jax.training.state import initial_state
 
 _ROUNDS = 5
 # Batches before the clock starts: until then, threads and workers fill their queues.
@@ -184,8 +183,7 @@ def _waiting(config: Config, sources: dict[str, _Source], settings: Settings, ou
         outcome.line("short form: in the loop of training, a stand-in takes the place of the training step")
     function = _stand_in if settings.short else step.bind(step.train_step, network, config)
     take = parallel.compile_step(function, mesh, donate=True)
-    fresh = initial_state(material.fresh_variables(network, config), config, material.LABELS)
-    state = jax.device_put(fresh, parallel.replicated(mesh))
+    state = material.fresh_state(config, mesh)
     waited: dict[str, list[float]] = {}
 
     def contender(name: str) -> Contender:

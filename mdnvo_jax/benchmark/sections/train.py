@@ -16,7 +16,7 @@ from mdnvo_jax.evaluation.tables import Column, Row, Table, Value
 from mdnvo_jax.model.conv import LAYERS
 from mdnvo_jax.model.network import build
 from mdnvo_jax.training import parallel, step
-from mdnvo_jax.training.state import State, initial_state
+from mdnvo_jax.training.state import State
 
 _ROUNDS = 9
 # For one size: a slow machine gets fewer rounds, never a smaller batch.
@@ -82,9 +82,7 @@ class _Ours:
 
     def fresh(self) -> State:
         """Return the state before the first step."""
-        variables = material.fresh_variables(build(self.config.image, self.config.model), self.config)
-        state = initial_state(variables, self.config, material.LABELS)
-        return jax.device_put(state, parallel.replicated(self.mesh))
+        return material.fresh_state(self.config, self.mesh)
 
     def compiled(self, config: Config) -> Any:
         """Return the compiled step of a variant."""
