@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from mdnvo_jax.benchmark import agreement, growth, machine, material, memory, peers, targets, timing
+import mdnvo_jax
+from mdnvo_jax.benchmark import agreement, child, growth, machine, material, memory, peers, targets, timing
 from mdnvo_jax.benchmark.__main__ import SECTIONS, main
 from mdnvo_jax.benchmark.outcome import Outcome
 from mdnvo_jax.benchmark.report import Report
@@ -96,6 +97,14 @@ def test_a_missing_peer_is_a_line_and_no_crash() -> None:
     assert outcome.lines[0] == (
         "no_such_module is not installed, so its rows are left out: pip install 'mdnvo_jax[bench]'"
     )
+
+
+def test_a_child_runs_what_this_process_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "of/the/user")
+    script = "import os, mdnvo_jax as m; print(m.__file__, os.environ['A'], 'JAX_COMPILATION_CACHE_DIR' in os.environ)"
+    assert child.run(["-c", script], {"A": "b"}).split() == [mdnvo_jax.__file__, "b", "False"]
+    with pytest.raises(RuntimeError, match=r"^python -c .* failed: (.|\n)*ZeroDivisionError"):
+        child.run(["-c", "1 / 0"])
 
 
 def test_targets_are_all_there_and_judged() -> None:

@@ -2,7 +2,6 @@
 
 import dataclasses
 import os
-import subprocess
 import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
@@ -11,7 +10,7 @@ import jax
 import numpy as np
 
 from mdnvo_jax import mixture, predictor
-from mdnvo_jax.benchmark import contest, material
+from mdnvo_jax.benchmark import child, contest, material
 from mdnvo_jax.benchmark.growth import exponent
 from mdnvo_jax.benchmark.outcome import Outcome, Settings
 from mdnvo_jax.benchmark.timing import Contender, interleaved, spread
@@ -147,11 +146,8 @@ def _by_components(settings: Settings) -> dict[float, Contender]:
 def _with_devices(count: int) -> list[float]:
     """Return the seconds of training steps split over virtual devices, measured in a process that has so many."""
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={count}"
-    command = [sys.executable, "-m", "mdnvo_jax.benchmark.sections.growth", str(count)]
-    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, "XLA_FLAGS": flags})
-    if done.returncode:
-        raise RuntimeError(f"{command} failed: {done.stderr[-2000:]}")
-    return [float(word) for word in done.stdout.split()]
+    printed = child.run(["-m", "mdnvo_jax.benchmark.sections.growth", str(count)], {"XLA_FLAGS": flags})
+    return [float(word) for word in printed.split()]
 
 
 def _print_steps(devices: int) -> None:

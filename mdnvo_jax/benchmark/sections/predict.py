@@ -1,14 +1,12 @@
 """Section predict: frames a second offline, milliseconds a frame streaming, memory, beside the twin in PyTorch."""
 
 import dataclasses
-import subprocess
-import sys
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from mdnvo_jax.benchmark import contest, material
+from mdnvo_jax.benchmark import child, contest, material
 from mdnvo_jax.benchmark.agreement import agree
 from mdnvo_jax.benchmark.contest import CACHING, OURS, RECOMPUTING, Contest
 from mdnvo_jax.benchmark.outcome import Outcome, Settings, compared
@@ -128,11 +126,8 @@ def _memory(entered: Contest, counts: Sequence[int], settings: Settings, outcome
     checkpoint = material.write_checkpoint(entered.model, entered.config, settings.folder / "network")
     peaks = []
     for count in counts:
-        command = [sys.executable, "-m", "mdnvo_jax.benchmark.memory", str(checkpoint), str(count)]
-        done = subprocess.run(command, capture_output=True, text=True)
-        if done.returncode:
-            raise RuntimeError(f"{command} failed: {done.stderr[-2000:]}")
-        peaks.append(float(done.stdout.split()[-1]))
+        printed = child.run(["-m", "mdnvo_jax.benchmark.memory", str(checkpoint), str(count)])
+        peaks.append(float(printed.split()[-1]))
     outcome.times(f"predict {size}, peak memory, MB", {f"{n}": [peak] for n, peak in zip(counts, peaks, strict=True)})
     outcome.target("memory", f"{size}, {counts[-1]:,} over {counts[0]:,} frames", Value(peaks[-1] / peaks[0]))
     return [{"size": size, "frames": f"{n:,}", "mb": Value(peak)} for n, peak in zip(counts, peaks, strict=True)]

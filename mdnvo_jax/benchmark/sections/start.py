@@ -1,13 +1,8 @@
 """Section start: seconds from the shell's prompt to help, to an import, to a first prediction."""
 
 import functools
-import os
-import subprocess
-import sys
-from collections.abc import Mapping, Sequence
-from pathlib import Path
 
-from mdnvo_jax.benchmark import material, peers
+from mdnvo_jax.benchmark import child, material, peers
 from mdnvo_jax.benchmark.outcome import Outcome, Settings, compared
 from mdnvo_jax.benchmark.timing import Contender, interleaved, spread
 from mdnvo_jax.evaluation.tables import Column, Table
@@ -25,12 +20,12 @@ def measure(settings: Settings) -> Outcome:
     """Measure how long processes take to start."""
     outcome = Outcome()
     commands = ("predict",) if settings.short else ("predict", "train", "evaluate", "synthesize")
-    contenders: dict[str, Contender] = {PYTHON: lambda: _run(["-c", "pass"])}
+    contenders: dict[str, Contender] = {PYTHON: lambda: child.run(["-c", "pass"])}
     for name in commands:
-        contenders[f"{name} --help"] = functools.partial(_run, ["-m", f"mdnvo_jax.{name}", "--help"])
-    contenders["import mdnvo_jax.mixture"] = lambda: _run(["-c", "import mdnvo_jax.mixture"])
+        contenders[f"{name} --help"] = functools.partial(child.run, ["-m", f"mdnvo_jax.{name}", "--help"])
+    contenders["import mdnvo_jax.mixture"] = lambda: child.run(["-c", "import mdnvo_jax.mixture"])
     if not settings.short and peers.available("torch", outcome):
-        contenders["import torch"] = lambda: _run(["-c", "import torch"])
+        contenders["import torch"] = lambda: child.run(["-c", "import torch"])
     found = interleaved(contenders, settings.rounds(_ROUNDS), warm_up=0 if settings.short else 1)
     predictions = interleaved(_predictions(settings), 1 if settings.short else _PREDICTIONS, warm_up=0)
     if settings.short:
@@ -61,20 +56,9 @@ def _predictions(settings: Settings) -> dict[str, Contender]:
 
     def predict(kept: bool) -> None:
         options = {"XDG_CACHE_HOME": str(store), "JAX_ENABLE_COMPILATION_CACHE": str(kept).lower()}
-        _run([*arguments, "--force"], options)
+        child.run([*arguments, "--force"], options)
 
     if settings.short:
         return {COLD: lambda: predict(False)}
     predict(True)
     return {COLD: lambda: predict(False), WARM: lambda: predict(True)}
-
-
-def _run(arguments: Sequence[str], environment: Mapping[str, str] | None = None) -> None:
-    """Run Python in a process of its own, as this one was installed."""
-    here = Path(__file__).parents[3]
-    variables = {**os.environ, **(environment or {})}
-    # The user's folder of compiled programs is neither used nor filled: the one of these runs is made for them.
-    variables.pop("JAX_COMPILATION_CACHE_DIR", None)
-    done = subprocess.run([sys.executable, *arguments], capture_output=True, text=True, cwd=here, env=variables)
-    if done.returncode:
-        raise RuntimeError(f"python {' '.join(arguments)} failed: {done.stderr[-2000:]}")
