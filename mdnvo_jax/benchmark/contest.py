@@ -66,12 +66,9 @@ class Contest:
         for precision, twin in self.twins.items():
             found[CACHING + precision] = functools.partial(twin.caching, self.sequence)
             name = RECOMPUTING + precision
-            took, float32 = self.took[name], self.took[RECOMPUTING + "float32"]
-            if took > _LONG_S and took > float32:
-                outcome.line(
-                    f"{self.size}: {name}, took {took:.1f} s in its first run, and {float32:.1f} s in float32: it was "
-                    "left out of the rounds"
-                )
+            exact = RECOMPUTING + "float32"
+            if self.took[name] > max(_LONG_S, self.took[exact]):
+                outcome.left_out(self.size, name, self.took[name], exact, self.took[exact])
             else:
                 found[name] = functools.partial(twin.recomputing, self.sequence)
         return found

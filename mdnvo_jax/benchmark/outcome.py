@@ -55,6 +55,13 @@ class Outcome:
         if text not in self.lines:
             self.lines.append(text)
 
+    def left_out(self, size: str, name: str, took_s: float, other: str, other_s: float) -> None:
+        """Say that a contender was too slow to be run again: what it took, and what another one did."""
+        self.line(
+            f"{size}: {name} took {took_s:.1f} s in its first run, and {other} {other_s:.1f} s: it was left out of the "
+            "rounds"
+        )
+
     def target(self, key: str, where: str, value: Value) -> None:
         """Add what was measured for a target."""
         self.targets.setdefault(key, []).append((where, value))

@@ -99,6 +99,14 @@ def test_a_missing_peer_is_a_line_and_no_crash() -> None:
     )
 
 
+def test_what_is_too_slow_is_said_with_what_it_took() -> None:
+    outcome = Outcome()
+    outcome.left_out("256x80", "the slow one", 31.26, "the quick one", 4.0)
+    assert outcome.lines == [
+        "256x80: the slow one took 31.3 s in its first run, and the quick one 4.0 s: it was left out of the rounds"
+    ]
+
+
 def test_a_child_runs_what_this_process_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("JAX_COMPILATION_CACHE_DIR", "of/the/user")
     script = "import os, mdnvo_jax as m; print(m.__file__, os.environ['A'], 'JAX_COMPILATION_CACHE_DIR' in os.environ)"

@@ -133,8 +133,5 @@ def _torch(
     contenders: dict[str, Contender] = {TORCH: lambda: run(False), TORCH_BF16: lambda: run(True)}
     if took[TORCH_BF16] > _HOPELESS * took[TORCH]:
         del contenders[TORCH_BF16]
-        outcome.line(
-            f"{size}: {TORCH_BF16}, took {took[TORCH_BF16]:.1f} s in its first run, {TORCH}, {took[TORCH]:.1f} s: it "
-            "was left out of the rounds"
-        )
+        outcome.left_out(size, TORCH_BF16, took[TORCH_BF16], TORCH, took[TORCH])
     return contenders
