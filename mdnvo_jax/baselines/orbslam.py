@@ -25,7 +25,6 @@ import time
 from collections.abc import Callable, Iterable
 from collections.abc import Sequence as Many
 from dataclasses import dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, get_args
 
@@ -329,7 +328,7 @@ def main(arguments: Many[str]) -> None:
         stride=options.stride,
         vocabulary={"file": options.vocabulary, "sha256": _sha256(options.vocabulary)},
         command=shlex.join(sys.orig_argv),
-        versions={**logs.versions(), "pyorbslam3": metadata.version("pyorbslam3")},
+        versions=logs.versions("pyorbslam3"),
     )
     if wrong := failure(tracked):
         print(f"error: {wrong}; {output / SUMMARY} says more", file=sys.stderr)

@@ -5,29 +5,19 @@ import os
 import platform
 import shlex
 import sys
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 # What decides how fast a processor multiplies.
 _FLAGS = ("avx2", "fma", "avx512f", "avx512_vnni", "avx512_bf16", "avx512_fp16", "amx_tile", "amx_int8", "amx_bf16")
-_PACKAGES = (
-    "mdnvo_jax",
-    "jax",
-    "jaxlib",
-    "flax",
-    "optax",
-    "grain",
-    "numpy",
-    "opencv-python-headless",
-    "openvino",
-    "torch",
-    "numpyro",
-)
+_PEERS = ("openvino", "torch", "numpyro")
 
 
 def describe(threads: int) -> dict[str, Any]:
     """Return the machine, the versions and the command."""
+    # Here, so that a process whose memory is measured does without it.
+    from mdnvo_jax.training.logs import versions
+
     cpu = _cpu_info()
     flags = cpu.get("flags", "").split()
     return {
@@ -41,7 +31,7 @@ def describe(threads: int) -> dict[str, Any]:
         "threads": threads,
         "platform": platform.platform(),
         "memory_gb": _memory_gb(),
-        "versions": {"python": platform.python_version(), **_versions()},
+        "versions": versions(*_PEERS),
     }
 
 
@@ -69,16 +59,6 @@ def peak_memory_mb() -> float:
 
     unit = 1024**2 if sys.platform == "darwin" else 1024
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / unit
-
-
-def _versions() -> dict[str, str]:
-    found = {}
-    for name in _PACKAGES:
-        try:
-            found[name] = metadata.version(name)
-        except metadata.PackageNotFoundError:
-            found[name] = "not installed"
-    return found
 
 
 def _cpu_info() -> dict[str, str]:

@@ -76,8 +76,8 @@ def environment() -> dict[str, Any]:
     }
 
 
-def versions() -> dict[str, str]:
-    """Return the versions of Python and of the packages that results depend on."""
+def versions(*others: str) -> dict[str, str]:
+    """Return the versions of Python, of the packages that results depend on, and of `others`."""
     names = (
         "mdnvo_jax",
         "jax",
@@ -88,8 +88,16 @@ def versions() -> dict[str, str]:
         "grain",
         "numpy",
         "opencv-python-headless",
+        *others,
     )
-    return {"python": platform.python_version(), **{name: metadata.version(name) for name in names}}
+    return {"python": platform.python_version(), **{name: _version(name) for name in names}}
+
+
+def _version(name: str) -> str:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return "not installed"
 
 
 def _git_hash() -> str | None:

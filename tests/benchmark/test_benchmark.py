@@ -160,7 +160,8 @@ def test_the_machine_is_described() -> None:
     found = machine.describe(3)
     assert found["threads"] == 3
     assert found["cores"] == os.cpu_count()
-    assert found["versions"]["jax"]
+    assert found["versions"]["jax"] == jax.__version__
+    assert {"python", "mdnvo_jax", "torch", "openvino", "numpyro"} <= set(found["versions"])
     assert not set(found["flags"]) & set(found["flags_missing"])
     held = np.ones(30_000_000)
     before = machine.peak_memory_mb()

@@ -16,7 +16,7 @@ from mdnvo_jax import train
 from mdnvo_jax.config import from_json
 from mdnvo_jax.errors import exit_code
 from mdnvo_jax.model.network import build
-from mdnvo_jax.training import checkpoint
+from mdnvo_jax.training import checkpoint, logs
 from mdnvo_jax.training.state import State, state_template
 
 CONFIG = """
@@ -102,6 +102,7 @@ def test_a_training_leaves_what_it_promises(uninterrupted: Path) -> None:
     labels = json.loads((uninterrupted / "labels.json").read_text())
     assert set(labels) == {"mean", "std"}
     assert json.loads((uninterrupted / "environment.json").read_text())["versions"]["jax"] == jax.__version__
+    assert logs.versions("jax", "no-such-package")["no-such-package"] == "not installed"
     config = from_json((uninterrupted / "config.json").read_text())
     assert config.image.camera == pytest.approx((40, 40, 31.5, 15.5)), "the resolved camera belongs to the experiment"
     assert any((uninterrupted / "tensorboard").iterdir())
