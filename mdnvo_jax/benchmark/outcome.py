@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from mdnvo_jax.benchmark.timing import spread
+from mdnvo_jax.benchmark.timing import ratio, spread
 from mdnvo_jax.evaluation.tables import Table, Value
 
 
@@ -73,8 +73,6 @@ class Outcome:
 
 def compared(name: str, seconds: Mapping[str, Sequence[float]], ours: str) -> dict[str, Any]:
     """Return the cells of a row that tell the time of the contender `name`, and the ratio to that of `ours`."""
-    from mdnvo_jax.benchmark.timing import ratio
-
     return {
         "contender": name,
         "ms": spread(seconds[name], 1e3),

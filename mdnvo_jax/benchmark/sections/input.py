@@ -13,7 +13,7 @@ from mdnvo_jax import geometry
 from mdnvo_jax.benchmark import material, peers
 from mdnvo_jax.benchmark.agreement import DisagreementError
 from mdnvo_jax.benchmark.outcome import Outcome, Settings, compared
-from mdnvo_jax.benchmark.timing import Contender, Untimed, fastest, interleaved, ratio, spread
+from mdnvo_jax.benchmark.timing import Contender, Untimed, fastest, interleaved, rate, ratio, spread
 from mdnvo_jax.config import Config
 from mdnvo_jax.data.cache import prepare_cache, read_cache
 from mdnvo_jax.data.folder import read_frames
@@ -116,10 +116,7 @@ def _loading(config: Config, sources: dict[str, _Source], folder: Path, settings
             Column("ratio", "time over ours, from the cache", digits=2),
             Column("n", "rounds"),
         ],
-        rows=[
-            {**compared(name, found, CACHE), "rate": spread([frames_in_batch / value for value in found[name]])}
-            for name in contenders
-        ],
+        rows=[{**compared(name, found, CACHE), "rate": rate(found[name], frames_in_batch)} for name in contenders],
         notes=[
             "Nothing else runs meanwhile. Files are in the page cache of the system.",
             f"Ours: {config.data.threads} threads. DataLoader: the same windows, decoded and resized by the same "
