@@ -4,8 +4,8 @@ It imports torch at its head: only sections that found torch import this module.
 """
 
 import functools
+from collections import defaultdict
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from typing import Any
 
 import numpy as np
@@ -14,7 +14,7 @@ from torch import Tensor
 
 from mdnvo_jax.benchmark.torch_twin import Density, Twin, copy_weights, for_prediction
 from mdnvo_jax.config import Config, ImageConfig
-from mdnvo_jax.data.images import prepare
+from mdnvo_jax.data import ahead
 from mdnvo_jax.data.sequence import Sequence
 from mdnvo_jax.mixture import Mixture
 from mdnvo_jax.odometry import Trajectory, trajectory, window_plan
@@ -44,7 +44,7 @@ class TorchPredictor:
         frames: list[Tensor] = []
         outputs: list[Tensor] = []
         waiting = 0
-        for frame in _prepared(sequence, self.config.image):
+        for frame in _frames(sequence, self.config.image):
             frames.append(frame)
             waiting += len(frames) > window
             if waiting == _BATCH or (waiting and len(frames) + len(outputs) == sequence.count):
@@ -59,16 +59,7 @@ class TorchPredictor:
     def caching(self, sequence: Sequence) -> Trajectory:
         """Predict as ours does: every pair through the convolutions once, the LSTM over the same windows."""
         window = self.config.data.window
-        features: list[Tensor] = []
-        pending: list[Tensor] = []
-        for frame in _prepared(sequence, self.config.image):
-            pending.append(frame)
-            if len(pending) == _BATCH + 1:
-                features.append(self.pairs(torch.stack(pending)))
-                pending = pending[-1:]
-        if len(pending) > 1:
-            features.append(self.pairs(torch.stack(pending)))
-        every = torch.cat(features)
+        every = torch.cat([self.pairs(frames) for frames in _chunks(sequence, self.config.image)])
         plan = list(window_plan(len(every), window, max(1, window // 2)))
         found = []
         for place in range(0, len(plan), _BATCH):
@@ -126,16 +117,13 @@ def _mean(density: tuple[Tensor, Tensor, Tensor]) -> np.ndarray:
     return (torch.softmax(logits, -1)[..., None] * means).sum(-2).numpy()
 
 
-def _prepared(sequence: Sequence, image: ImageConfig) -> Iterator[Tensor]:
-    """Yield the frames of a sequence as the network sees them, read ahead on a thread of its own."""
+def _chunks(sequence: Sequence, image: ImageConfig) -> Iterator[Tensor]:
+    """Yield the frames of pairs, the last of a chunk being the first of the next, read ahead as ours are."""
+    for chunk in ahead.chunks(sequence, image, _BATCH, hold=False, seconds=defaultdict(float)):
+        yield torch.from_numpy(chunk.frames[: chunk.pairs + 1])
 
-    def frame(index: int) -> Tensor:
-        return torch.from_numpy(np.ascontiguousarray(prepare(sequence.read(index), sequence.camera, image)))
 
-    with ThreadPoolExecutor(max_workers=1) as ahead:
-        waiting = [ahead.submit(frame, index) for index in range(min(_BATCH, sequence.count))]
-        for index in range(sequence.count):
-            ready = waiting.pop(0).result()
-            if index + _BATCH < sequence.count:
-                waiting.append(ahead.submit(frame, index + _BATCH))
-            yield ready
+def _frames(sequence: Sequence, image: ImageConfig) -> Iterator[Tensor]:
+    """Yield every frame once."""
+    for index, frames in enumerate(_chunks(sequence, image)):
+        yield from frames[index > 0 :]

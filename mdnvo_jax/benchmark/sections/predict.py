@@ -147,8 +147,8 @@ def _tables(rows: Mapping[str, list[Row]], settings: Settings) -> list[Table]:
         "float32 in all, as in ours.",
         "DeepVO-style: a window of 6 pairs for every step, 5 of them shared with the window before, all recomputed. "
         "Caching: every pair once, the LSTM over the windows that ours uses, half a window apart.",
-        "All: frames resized by the same function on a thread that runs ahead, trajectory with covariance at the end. "
-        "Compilation and trial runs before the first frame are not counted; section start has them.",
+        "All: frames read and resized ahead by the same function on as many threads, trajectory with covariance at the "
+        "end. Compilation and trial runs before the first frame are not counted; section start has them.",
     ]
     found = [
         Table(f"Offline from decoded frames ({source})", offline, rows["decoded"], notes=notes),
