@@ -162,6 +162,22 @@ def test_the_camera_brings_frames_to_that_of_the_training(model: predictor.Predi
     assert np.abs(other.steps - path.steps).max() > 1e-3
 
 
+def test_a_lens_that_sees_too_little_is_warned_of(
+    model: predictor.Predictor, folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    for camera in (None, CONFIG.image.camera, (30.0, 30.0, 31.5, 15.5), (40.0, 40.0, 29.5, 15.5)):
+        predictor.predict(model, FRAMES[:2], camera=camera)
+        assert capsys.readouterr().err == "", camera
+    # Twice the focal length: half the width, half the height. The first frame that can be read has the size.
+    (tmp_path / "frame0.png").write_bytes(b"")
+    for index in range(1, 12):
+        (tmp_path / f"frame{index}.png").write_bytes((folder / f"frame{index}.png").read_bytes())
+    predictor.predict(model, tmp_path, camera=(80.0, 80.0, 31.5, 15.5), bad_frames="hold")
+    warning = capsys.readouterr().err
+    assert warning.startswith(f"warning: {tmp_path} does not show 75 % of what")
+    assert warning.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     ("frames", "message"),
     [
