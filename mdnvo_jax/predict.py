@@ -14,7 +14,11 @@ from mdnvo_jax.errors import InputError, Parser, exit_code
 def main(arguments: Sequence[str]) -> None:
     """Predict as the command line says."""
     parser = Parser("python -m mdnvo_jax.predict", description="Estimate a trajectory with covariance from images.")
-    parser.add_argument("images", metavar="IMAGES", help="a folder, a glob in quotes, a video, or a KITTI sequence")
+    parser.add_argument(
+        "images",
+        metavar="IMAGES",
+        help="a folder, a glob in quotes, a video, or a KITTI sequence (such as image_0 with a calib.txt beside it)",
+    )
     parser.add_argument("--checkpoint", required=True, metavar="DIR", help="the --workdir of a training")
     parser.add_argument("--output", required=True, metavar="DIR", help="the files are written here")
     parser.add_argument("--force", action="store_true", help="overwrite files in --output")

@@ -124,6 +124,22 @@ def test_a_kitti_sequence_brings_its_camera_and_times(kitti_root):
     assert "image_0" in read_frames(folder, 3, stride=2).label(0)
 
 
+def test_a_folder_called_as_in_kitti_takes_the_files_beside_it_and_no_other_does(pictures):
+    """The README tells whoever has such files of another kind to rename the folder."""
+    (pictures.parent / "calib.txt").write_text("P0: 72 0 60.7 0 0 71 18.5 0 0 0 1 0\n")
+    (pictures.parent / "times.txt").write_text("\n".join(str(index / 10) for index in range(12)))
+    for name in ("drive", "image_x"):
+        sequence = read_frames(pictures.rename(pictures.parent / name), 1)
+        assert sequence.camera is None and sequence.timestamps is None
+        pictures = pictures.parent / name
+    like_kitti = pictures.rename(pictures.parent / "image_0")
+    assert read_frames(like_kitti, 1).camera == pytest.approx((72.0, 71.0, 60.7, 18.5))
+    np.testing.assert_allclose(read_frames(like_kitti, 1).timestamps, np.arange(12) / 10)
+    (pictures.parent / "calib.txt").write_text("fx = 72\n")
+    with pytest.raises(InputError, match=r"calib\.txt"):
+        read_frames(like_kitti, 1)
+
+
 def test_a_real_kitti_sequence(data_root):
     sequence = read_frames(data_root / "kitti" / "sequences" / "06", 1, stride=10)
     assert sequence.count == 6 and sequence.camera[0] == pytest.approx(707.0912)
