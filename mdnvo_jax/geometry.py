@@ -266,6 +266,20 @@ def propagate_covariance(
     return xp.moveaxis((covariances + _transpose(covariances)) / 2, 0, -3)
 
 
+def scale_covariance(poses: Array, sigma: float) -> Array:
+    """Covariance `[..., N, 6, 6]` that one error of scale, common to all steps, gives poses `[..., N, 4, 4]` of a path.
+
+    True translations are (1 + e) times the given ones, with one e of standard deviation `sigma` for the whole path. The
+    pose j then lies e (p_j - p_0) further from the first one and is turned as it was: a right perturbation e J_j with
+    J_j = (R_j^T (p_j - p_0), 0), of covariance sigma^2 J_j J_j^T; exact, not only to first order. It is added to
+    what `propagate_covariance` gives, in which the errors of steps are independent and average out.
+    """
+    xp, poses = _inputs((poses, (None, 4, 4)))
+    moved = _apply(_transpose(poses[..., :3, :3]), poses[..., :3, 3] - poses[..., :1, :3, 3])
+    direction = sigma * xp.concatenate([moved, xp.zeros_like(moved)], axis=-1)
+    return direction[..., :, None] * direction[..., None, :]
+
+
 def _then(earlier: tuple[Any, Any], later: tuple[Any, Any]) -> tuple[Any, Any]:
     """Two stretches of path as one: P -> F P F^T + Q composed with itself."""
     (F_earlier, Q_earlier), (F_later, Q_later) = earlier, later

@@ -26,13 +26,15 @@ class Trajectory:
 
     Attributes:
       poses: `[N, 4, 4]`, `T_world_camera`; the first is the identity.
-      covariance: `[N, 6, 6]`, of a right perturbation of each pose, `T = T_mean @ exp(xi)`; the first is zero.
+      covariance: `[N, 6, 6]`, of a right perturbation of each pose, `T = T_mean @ exp(xi)`; the first is zero. It holds
+        the errors of the steps, as if they were independent, and that of the scale.
       steps: `[N-1, 6]`, the relative poses as (tx, ty, tz, rx, ry, rz).
-      step_covariance: `[N-1, 6, 6]`, covariance of those vectors.
+      step_covariance: `[N-1, 6, 6]`, covariance of those vectors: of a step by itself, whatever its errors come from.
       timestamps: `[N]` s; frame numbers where the source has none.
       flags: a word a step, empty where nothing is to be said.
       mixture: the density of each step, `[N-1, M]` and `[N-1, M, 6]`.
       coupling: how that density combines its dimensions.
+      scale_sigma: relative standard deviation of the error of scale that all steps share; see `trajectory`.
       about: what else belongs in summary.json.
     """
 
@@ -44,6 +46,7 @@ class Trajectory:
     flags: Sequence[str]
     mixture: Mixture
     coupling: Coupling
+    scale_sigma: float = 0.0
     about: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     @property
@@ -89,8 +92,15 @@ def trajectory(
     flags: Sequence[str] | None = None,
     estimate: Estimate = "mean",
     order: Literal[1, 2] = 1,
+    scale_sigma: float = 0.0,
 ) -> Trajectory:
     """Integrate the densities of consecutive steps (equation 8) and propagate their covariance.
+
+    Errors of steps average out along the path as far as they are independent. What all steps of a run are wrong by, a
+    scale that is off because the road, the lens or the mount is unlike the training's, does not:
+    `geometry.scale_covariance` says what it adds to the covariance of poses. The steps stay as they are, for their
+    sigmas are meant to hold for each step by itself, an error of scale included. So its share in a single step is in a
+    pose's covariance twice, once as if independent: of n steps alike that is at most one part in n of the scale's term.
 
     Args:
       steps: logits `[N-1, M]`, mean and log_scale `[N-1, M, 6]`, in metres and radians.
@@ -100,7 +110,13 @@ def trajectory(
       estimate: "mean" and covariance of the whole mixture (law of total variance), or those of the "strongest"
         component.
       order: of the covariance propagation, 1 or 2; see `geometry.propagate_covariance`.
+      scale_sigma: true translations are (1 + e) times those of the steps, with one e of this standard deviation.
+
+    Raises:
+      InputError: `scale_sigma` is no number of 0 or more.
     """
+    if not (np.isfinite(scale_sigma) and scale_sigma >= 0):
+        raise InputError(f"the scale's sigma is {scale_sigma}: expected a share such as 0.05, 0 or more")
     leaves: list[Any] = [np.asarray(leaf, np.float64) for leaf in steps]
     steps = Mixture(*leaves)
     reported = mixture.strongest(steps) if estimate == "strongest" else steps
@@ -109,15 +125,18 @@ def trajectory(
     matrices = geometry.step_to_matrix(vectors)
     perturbation = geometry.step_covariance_to_perturbation(vectors, covariance)
     count = len(vectors) + 1
+    poses = np.asarray(geometry.accumulate(matrices))
+    propagated = np.asarray(geometry.propagate_covariance(matrices, perturbation, order=order))
     return Trajectory(
-        poses=np.asarray(geometry.accumulate(matrices)),
-        covariance=np.asarray(geometry.propagate_covariance(matrices, perturbation, order=order)),
+        poses=poses,
+        covariance=propagated + geometry.scale_covariance(poses, scale_sigma),
         steps=vectors,
         step_covariance=covariance,
         timestamps=np.arange(count, dtype=np.float64) if timestamps is None else np.asarray(timestamps, np.float64),
         flags=[""] * (count - 1) if flags is None else list(flags),
         mixture=steps,
         coupling=coupling,
+        scale_sigma=float(scale_sigma),
         about={"estimate": estimate, "timestamps": "frame numbers" if timestamps is None else "given"},
     )
 
@@ -203,5 +222,6 @@ def _summary(path: Trajectory) -> dict[str, Any]:
         "median_step_sigma": dict(zip(COMPONENTS, np.median(path.sigma, axis=0).tolist(), strict=True)),
         "flagged_steps": sum(bool(flag) for flag in path.flags),
         "coupling": path.coupling,
+        "scale_sigma": path.scale_sigma,
         **path.about,
     }

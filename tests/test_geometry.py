@@ -406,6 +406,39 @@ def test_scan_and_loop_agree_on_a_long_path() -> None:
         np.testing.assert_allclose(found[-1] / np.outer(scale, scale), expected[-1] / np.outer(scale, scale), atol=1e-3)
 
 
+def test_an_error_of_scale_lengthens_the_way_from_the_first_pose(lib: SimpleNamespace) -> None:
+    poses = geo.accumulate(geo.step_to_matrix(steps(7, seed=4)), geo.step_to_matrix(steps(1, seed=5)[0]))
+    scaled = poses.copy()
+    error = -0.3
+    scaled[:, :3, 3] = poses[0, :3, 3] + (1 + error) * (poses[:, :3, 3] - poses[0, :3, 3])
+    # Right perturbations, exact however large the error is.
+    xi = geo.log_se3(geo.compose(geo.inverse(poses), scaled))
+    found = lib.scale_covariance(poses, 0.3)
+    np.testing.assert_allclose(found, xi[:, :, None] * xi[:, None, :], atol=1e-12)
+    assert not np.any(found[0])
+    # Batches of paths, and no error at all.
+    np.testing.assert_allclose(lib.scale_covariance(np.stack([poses, poses[::-1]]), 0.3)[0], found, atol=1e-12)
+    np.testing.assert_array_equal(lib.scale_covariance(poses, 0.0), np.zeros((8, 6, 6)))
+
+
+def test_independent_errors_and_one_of_scale_add_up(lib: SimpleNamespace) -> None:
+    """As a filter has it that carries the error of the scale along as a seventh state."""
+    rng = np.random.default_rng(3)
+    T_steps = geo.step_to_matrix(steps(9, seed=6, size=0.4))
+    covariances = np.stack([random_covariance(rng, np.full(6, 0.01)) for _ in range(9)])
+    sigma = 0.07
+    state = np.zeros((7, 7))
+    state[6, 6] = sigma**2
+    for T, covariance in zip(T_steps, covariances, strict=True):
+        carry = np.eye(7)
+        carry[:6, :6] = geo.adjoint(geo.inverse(T))
+        carry[:3, 6] = T[:3, :3].T @ T[:3, 3]
+        state = carry @ state @ carry.T
+        state[:6, :6] += covariance
+    found = lib.propagate_covariance(T_steps, covariances) + lib.scale_covariance(geo.accumulate(T_steps), sigma)
+    np.testing.assert_allclose(found[-1], state[:6, :6], atol=1e-12)
+
+
 # Namespaces and mistakes.
 
 

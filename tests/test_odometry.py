@@ -80,9 +80,65 @@ def test_a_monte_carlo_over_the_steps_has_the_covariance_that_is_told() -> None:
     np.testing.assert_allclose(np.cov(errors.T), path.covariance[-1], atol=0.05 * np.abs(path.covariance[-1]).max())
 
 
+def gaussian_steps(mean: np.ndarray, scale: np.ndarray) -> Mixture:
+    return Mixture(np.zeros((len(mean), 1)), mean[:, None], np.tile(np.log(scale), (len(mean), 1, 1)))
+
+
+def test_an_error_of_scale_grows_with_the_distance_where_those_of_steps_average_out() -> None:
+    straight = gaussian_steps(np.tile([0, 0, 2.0, 0, 0, 0], (100, 1)), np.array([0.01, 0.01, 0.1, 1e-9, 1e-9, 1e-9]))
+    path = odometry.trajectory(straight, coupling="joint", scale_sigma=0.05)
+    sigma = np.sqrt(np.diagonal(path.covariance, axis1=1, axis2=2))
+    count = np.arange(101)
+    np.testing.assert_allclose(sigma[:, 2], np.hypot(0.1 * np.sqrt(count), 0.05 * 2 * count), rtol=1e-6)
+    np.testing.assert_allclose(sigma[:, 0], 0.01 * np.sqrt(count), rtol=1e-6)
+    # What is said of single steps stays as it is.
+    alone = odometry.trajectory(straight, coupling="joint")
+    np.testing.assert_array_equal(path.step_covariance, alone.step_covariance)
+    np.testing.assert_array_equal(path.mixture.log_scale, alone.mixture.log_scale)
+    assert (alone.scale_sigma, path.scale_sigma) == (0, 0.05)
+
+
+def test_without_an_error_of_scale_nothing_changes() -> None:
+    path = odometry.trajectory(densities(30), coupling="joint", scale_sigma=0.0)
+    perturbation = geometry.step_covariance_to_perturbation(path.steps, path.step_covariance)
+    expected = geometry.propagate_covariance(geometry.step_to_matrix(path.steps), perturbation)
+    assert path.covariance.tobytes() == np.asarray(expected).tobytes()
+
+
+def test_a_monte_carlo_over_steps_and_scale_has_the_covariance_that_is_told() -> None:
+    generator = np.random.default_rng(2)
+    count, draws, scale_sigma = 30, 4000, 0.04
+    scale = np.array([0.01, 0.01, 0.03, 0.001, 0.004, 0.001])
+    mean = np.tile([0.02, 0, 1, 0, 0.07, 0], (count, 1)).astype(float)
+    path = odometry.trajectory(gaussian_steps(mean, scale), coupling="joint", scale_sigma=scale_sigma)
+    samples = np.tile(np.eye(4), (draws, 1, 1))
+    factor = 1 + scale_sigma * generator.normal(size=(draws, 1))
+    for index in range(count):
+        step = mean[index] + scale * generator.normal(size=(draws, 6))
+        step[:, :3] *= factor
+        samples = samples @ geometry.step_to_matrix(step)
+    errors = geometry.log_se3(geometry.inverse(path.poses[-1]) @ samples)
+    expected = path.covariance[-1]
+    np.testing.assert_allclose(np.cov(errors.T), expected, atol=0.05 * np.abs(expected).max())
+    # Without the term it would be told several times too small.
+    told = odometry.trajectory(gaussian_steps(mean, scale), coupling="joint").covariance[-1]
+    assert np.trace(np.linalg.solve(told, np.cov(errors.T))) / 6 > 1.5
+    assert np.trace(np.linalg.solve(expected, np.cov(errors.T))) / 6 == pytest.approx(1, abs=0.1)
+
+
+@pytest.mark.parametrize("sigma", [-0.01, float("nan"), float("inf")])
+def test_a_scale_error_that_is_none_is_named(sigma: float) -> None:
+    with pytest.raises(InputError, match="expected a share"):
+        odometry.trajectory(densities(3), coupling="joint", scale_sigma=sigma)
+
+
 def test_the_files_hold_the_trajectory(tmp_path: Path) -> None:
     path = odometry.trajectory(
-        densities(12), coupling="joint", timestamps=100 + 0.1 * np.arange(13), flags=["held"] + [""] * 11
+        densities(12),
+        coupling="joint",
+        timestamps=100 + 0.1 * np.arange(13),
+        flags=["held"] + [""] * 11,
+        scale_sigma=0.05,
     )
     path.save(tmp_path / "out")
     names = {entry.name for entry in (tmp_path / "out").iterdir()}
@@ -122,6 +178,7 @@ def test_the_files_hold_the_trajectory(tmp_path: Path) -> None:
     assert summary["frames"] == 13
     assert summary["flagged_steps"] == 1
     assert summary["coupling"] == "joint"
+    assert summary["scale_sigma"] == 0.05
 
 
 def test_results_are_not_overwritten_by_accident(tmp_path: Path) -> None:
