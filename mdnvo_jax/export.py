@@ -126,6 +126,8 @@ def _about(predictor: Predictor, start: dict[str, jax.Array], results: dict[str,
         "window": config.data.window,
         "platforms": list(PLATFORMS),
         "sigma_scale": None if predictor.sigma_scale is None else predictor.sigma_scale.tolist(),
+        "scale_sigma": predictor.scale_sigma,
+        "scale_sigma_is": "relative, 1 sigma, of all translations of a run together: belongs to poses, not to steps",
         "checkpoint": predictor.source,
         "versions": {"mdnvo_jax": mdnvo_jax.__version__, "jax": jax.__version__},
     }

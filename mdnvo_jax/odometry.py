@@ -115,8 +115,7 @@ def trajectory(
     Raises:
       InputError: `scale_sigma` is no number of 0 or more.
     """
-    if not (np.isfinite(scale_sigma) and scale_sigma >= 0):
-        raise InputError(f"the scale's sigma is {scale_sigma}: expected a share such as 0.05, 0 or more")
+    check_scale_sigma(scale_sigma)
     leaves: list[Any] = [np.asarray(leaf, np.float64) for leaf in steps]
     steps = Mixture(*leaves)
     reported = mixture.strongest(steps) if estimate == "strongest" else steps
@@ -139,6 +138,12 @@ def trajectory(
         scale_sigma=float(scale_sigma),
         about={"estimate": estimate, "timestamps": "frame numbers" if timestamps is None else "given"},
     )
+
+
+def check_scale_sigma(sigma: float) -> None:
+    """Raise an InputError where the standard deviation of a scale's error is no number of 0 or more."""
+    if not (np.isfinite(sigma) and sigma >= 0):
+        raise InputError(f"the scale's sigma is {sigma}: expected a share such as 0.05, 0 or more")
 
 
 def window_plan(count: int, window: int, hop: int) -> Iterator[tuple[int, int, int]]:

@@ -39,6 +39,12 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument(
         "--precision", choices=("float32", "bfloat16"), default="float32", help="of the products in the convolutions"
     )
+    parser.add_argument(
+        "--scale-sigma",
+        type=float,
+        metavar="SHARE",
+        help="1-sigma error of the path's scale, such as 0.05 [fitted]",
+    )
     parser.add_argument("--no-recalibration", action="store_true", help="sigmas as the network gave them")
     options = parser.parse_args(arguments)
     if options.stride < 1:
@@ -67,7 +73,13 @@ def main(arguments: Sequence[str]) -> None:
         camera=options.camera,
     )
     path = predictor.predict(
-        model, frames, mode=options.mode, bad_frames=options.bad_frames, estimate=options.estimate, progress=bar
+        model,
+        frames,
+        mode=options.mode,
+        bad_frames=options.bad_frames,
+        estimate=options.estimate,
+        scale_sigma=options.scale_sigma,
+        progress=bar,
     )
     path.about.update(command=shlex.join(sys.orig_argv), versions=logs.versions())
     path.save(output, force=True)

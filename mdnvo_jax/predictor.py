@@ -28,7 +28,7 @@ from mdnvo_jax.model import fold
 from mdnvo_jax.model.convolution import Products
 from mdnvo_jax.model.fold import Folded
 from mdnvo_jax.model.network import build
-from mdnvo_jax.odometry import Estimate, Trajectory, trajectory
+from mdnvo_jax.odometry import Estimate, Trajectory, check_scale_sigma, trajectory
 from mdnvo_jax.streaming import Stream, StreamStep, stream
 from mdnvo_jax.training import checkpoint
 from mdnvo_jax.training.state import Model, state_template
@@ -56,6 +56,8 @@ class Predictor(NamedTuple):
       backend: what computes the features.
       precision: of the products in the convolutions.
       sigma_scale: factors by component that every sigma is multiplied by already, `[6]`; None where none were fitted.
+      scale_sigma: relative standard deviation of the error of scale that the steps of a run share; 0 where none was
+        fitted. It belongs to absolute poses, see `odometry.trajectory`; what is said of single steps is without it.
     """
 
     config: Config
@@ -68,6 +70,7 @@ class Predictor(NamedTuple):
     backend: Backend
     precision: Precision
     sigma_scale: np.ndarray | None = None
+    scale_sigma: float = 0.0
 
 
 def load(
@@ -81,7 +84,8 @@ def load(
 
     Args:
       path: the folder.
-      recalibrated: multiply every sigma by what `evaluate recalibrate` left with the checkpoint, if it has.
+      recalibrated: use what `evaluate recalibrate` left with the checkpoint, if it has: factors for every sigma, and
+        the error of scale.
       backend: what computes the convolutions. "openvino" is for processors; where it is not installed JAX computes
         them, and a line on stderr says so. The LSTM and the head are JAX's always.
       precision: of the products in the convolutions; all else is float32. On a processor, "bfloat16" means something
@@ -99,6 +103,7 @@ def load(
         backend=backend,
         precision=precision,
         sigma_scale=None if found is None else found.scale,
+        scale_sigma=0.0 if found is None else found.scale_sigma,
     )
 
 
@@ -126,6 +131,7 @@ def from_model(
     backend: Backend = "jax",
     precision: Precision = "float32",
     sigma_scale: np.ndarray | None = None,
+    scale_sigma: float = 0.0,
 ) -> Predictor:
     """Return a predictor of a model in memory; the arguments are those of `load` and `Predictor`."""
     backend = backends.available(backend)
@@ -161,6 +167,7 @@ def from_model(
         backend=backend,
         precision=precision,
         sigma_scale=sigma_scale,
+        scale_sigma=scale_sigma,
     )
 
 
@@ -191,6 +198,7 @@ def predict(
     stride: int = 1,
     bad_frames: Literal["stop", "hold"] = "stop",
     estimate: Estimate = "mean",
+    scale_sigma: float | None = None,
     hop: int | None = None,
     progress: Callable[[Iterator[Any], int], Iterator[Any]] | None = None,
 ) -> Trajectory:
@@ -207,6 +215,8 @@ def predict(
       bad_frames: "stop" raises on a frame that cannot be read; "hold" repeats the last step, with the variance of the
         training's labels added to its own, and flags it.
       estimate: what is reported of a mixture, see `odometry.trajectory`.
+      scale_sigma: relative standard deviation of the error of scale, for one who knows the mount better than
+        `predictor.scale_sigma`, which it is by default; see `odometry.trajectory`.
       hop: steps between windows, up to a whole one, half of one by default; offline only.
       progress: wraps the iterator over chunks of frames to show how far it is; told the number of chunks.
 
@@ -219,6 +229,8 @@ def predict(
     sequence = as_sequence(frames, predictor.config.image.channels, stride=stride, timestamps=timestamps, camera=camera)
     if sequence.count < 2:
         raise InputError(f"{sequence.name}: found {sequence.count} frame, expected at least 2: a step needs a pair")
+    scale_sigma = predictor.scale_sigma if scale_sigma is None else scale_sigma
+    check_scale_sigma(scale_sigma)
     window = predictor.config.data.window
     hop = max(1, window // 2) if hop is None else hop
     if not 1 <= hop <= window:
@@ -244,6 +256,7 @@ def predict(
         timestamps=sequence.timestamps,
         flags=["held" if flag else "" for flag in held],
         estimate=estimate,
+        scale_sigma=scale_sigma,
     )
     about = {
         **result.about,

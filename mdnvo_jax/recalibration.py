@@ -1,4 +1,7 @@
-"""Factors that a model's sigmas are multiplied by, kept with the checkpoint whose weights they were fitted for."""
+"""How wrong a model was on validation drives: factors for its sigmas, and the error of its scale.
+
+Kept with the checkpoint whose weights they were fitted for.
+"""
 
 import json
 from collections.abc import Mapping
@@ -14,13 +17,14 @@ from mdnvo_jax.odometry import COMPONENTS
 
 # In the folder of a step, so that it is copied and deleted with the weights and never meets others.
 FILE = "sigma_scale.json"
-# Raised when what is stored, or its meaning, changes.
-VERSION = 1
+# Raised when what is stored, or its meaning, changes. Version 1 has no error of scale.
+VERSION = 2
+_READABLE = (1, VERSION)
 
 
 @dataclass(frozen=True)
 class SigmaScale:
-    """Fitted factors.
+    """What was fitted.
 
     Attributes:
       scale: by component (tx, ty, tz, rx, ry, rz), `[6]`, positive.
@@ -28,6 +32,8 @@ class SigmaScale:
       nll_before: mean over those steps, nats, m and rad.
       nll_after: the same with the factors applied.
       fitted_on: which data, in words and names.
+      scale_sigma: relative standard deviation of the error of scale that a drive's steps share; 0 where none was found.
+      drives: how many it was fitted on.
     """
 
     scale: np.ndarray
@@ -35,10 +41,12 @@ class SigmaScale:
     nll_before: float
     nll_after: float
     fitted_on: Mapping[str, Any]
+    scale_sigma: float = 0.0
+    drives: int = 0
 
 
 def read(step_folder: str | Path) -> SigmaScale | None:
-    """Return the factors of a checkpoint, None where none were fitted.
+    """Return what was fitted for a checkpoint, None where nothing was.
 
     Raises:
       InputError: the file is damaged or of another version.
@@ -49,8 +57,10 @@ def read(step_folder: str | Path) -> SigmaScale | None:
     mend = "fit again with `evaluate recalibrate --force`, or delete it"
     try:
         stored = json.loads(path.read_text(encoding="utf-8"))
-        if stored["version"] != VERSION:
+        if stored["version"] not in _READABLE:
             raise InputError(f"{path} has version {stored['version']}, expected {VERSION}: {mend}")
+        if stored["version"] == 1:
+            stored |= {"scale_sigma": 0.0, "drives": 0}
         scale = np.array(stored["scale"], np.float64)
         found = SigmaScale(
             scale=scale,
@@ -58,6 +68,8 @@ def read(step_folder: str | Path) -> SigmaScale | None:
             nll_before=float(stored["nll_before"]),
             nll_after=float(stored["nll_after"]),
             fitted_on=dict(stored["fitted_on"]),
+            scale_sigma=float(stored["scale_sigma"]),
+            drives=int(stored["drives"]),
         )
     except InputError:
         raise
@@ -65,11 +77,13 @@ def read(step_folder: str | Path) -> SigmaScale | None:
         raise InputError(f"{path} is damaged ({type(error).__name__}: {error}): {mend}") from error
     if scale.shape != (len(COMPONENTS),) or not (np.isfinite(scale) & (scale > 0)).all():
         raise InputError(f"{path}: scale {scale.tolist()}: expected six factors above 0: {mend}")
+    if not (np.isfinite(found.scale_sigma) and found.scale_sigma >= 0):
+        raise InputError(f"{path}: scale_sigma {found.scale_sigma}: expected 0 or more: {mend}")
     return found
 
 
 def write(step_folder: str | Path, found: SigmaScale, **about: Any) -> Path:
-    """Write the factors into the folder of a step, whole or not at all, and return the file's path."""
+    """Write what was fitted into the folder of a step, whole or not at all, and return the file's path."""
     path = Path(step_folder) / FILE
     data = {
         "version": VERSION,
@@ -78,6 +92,8 @@ def write(step_folder: str | Path, found: SigmaScale, **about: Any) -> Path:
         "steps": found.steps,
         "nll_before": found.nll_before,
         "nll_after": found.nll_after,
+        "scale_sigma": found.scale_sigma,
+        "drives": found.drives,
         "fitted_on": dict(found.fitted_on),
         **about,
     }

@@ -59,7 +59,7 @@ def parser() -> Parser:
 
 def _add_recalibrate(subcommands: "argparse._SubParsersAction[Parser]") -> None:
     """Add the subcommand that fits a sigma scale."""
-    fit_help = "fit a factor for each sigma on the training's own validation split, for predict to apply"
+    fit_help = "fit a factor for each sigma, and the error of scale, on the training's validation split, for predict"
     add = subcommands.add_parser("recalibrate", help=fit_help, description=fit_help).add_argument
     add("--checkpoint", required=True, metavar="DIR", help="the --workdir of a training; the factors are kept in it")
     add("--root", metavar="DIR", help="the folder of the training's data set [where the training found it]")

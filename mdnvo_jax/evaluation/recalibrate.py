@@ -1,4 +1,4 @@
-"""A sigma scale fitted on the validation split of a training, and nothing else: what `evaluate recalibrate` does.
+"""Sigmas and the error of scale fitted on the validation split of a training alone: what `evaluate recalibrate` does.
 
 No sequence can be named: the split is that of the checkpoint's own configuration, so that no test data gets in.
 """
@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from mdnvo_jax import recalibration
+from mdnvo_jax import mixture, recalibration
 from mdnvo_jax.errors import InputError
 from mdnvo_jax.evaluation.calibration import SIGMA_LEVELS, StepScores, fit_sigma_scale, is_inside, score
 from mdnvo_jax.evaluation.calibration_tables import NOMINAL
 from mdnvo_jax.evaluation.model import track
+from mdnvo_jax.evaluation.scale_error import fit_scale_sigma, scale_error
 from mdnvo_jax.evaluation.tables import Column, Row, Table, Value
 from mdnvo_jax.mixture import Coupling, Mixture, widen
 from mdnvo_jax.odometry import COMPONENTS
@@ -30,6 +31,8 @@ if TYPE_CHECKING:
 
 # Fewer steps determine a factor to no better than 7 %: that of a Gaussian is known to 1 / sqrt(2 n).
 _FEW_STEPS = 100
+# Fewer drives determine the error of scale to no better than 16 %, for the same reason.
+_FEW_DRIVES = 20
 
 
 def run(options: argparse.Namespace) -> tuple[Table, Path]:
@@ -86,12 +89,15 @@ def validation_sequences(config: "Config", *, root: str | None, cache: str | Non
 def fit(
     predictions: Many[tuple[Mixture, np.ndarray]], coupling: Coupling, fitted_on: dict[str, Any]
 ) -> tuple[SigmaScale, Table]:
-    """Fit the factors of `calibration.fit_sigma_scale` on several sequences, and tabulate what they do to them.
+    """Fit factors and the error of scale on several sequences, and tabulate what the factors do to them.
+
+    The factors are those of `calibration.fit_sigma_scale`, over all steps. What the steps of a drive are wrong by
+    together is then judged by the sigmas that they have with the factors; see `scale_error`.
 
     Args:
       predictions: of each sequence, densities `[n, M, 6]` and true steps `[n, 6]`.
       coupling: of the densities.
-      fitted_on: what the predictions are of, to be kept.
+      fitted_on: what the predictions are of, to be kept, beside the error of scale of each.
 
     Raises:
       InputError: there is no step.
@@ -104,8 +110,30 @@ def fit(
     scale = fit_sigma_scale(density, truth)
     before = score(density, truth, coupling=coupling)
     after = score(widen(density, scale), truth, coupling=coupling)
-    found = SigmaScale(scale, len(truth), float(before.nll.mean()), float(after.nll.mean()), fitted_on)
+    errors, variances = _scale_errors(predictions, coupling, scale)
+    found = SigmaScale(
+        scale=scale,
+        steps=len(truth),
+        nll_before=float(before.nll.mean()),
+        nll_after=float(after.nll.mean()),
+        fitted_on=fitted_on | {"scale_errors": errors.tolist()},
+        scale_sigma=fit_scale_sigma(errors, variances),
+        drives=int(np.isfinite(variances).sum()),
+    )
     return found, _table(found, before, after)
+
+
+def _scale_errors(
+    predictions: Many[tuple[Mixture, np.ndarray]], coupling: Coupling, scale: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the error of scale of each sequence and its variance, with sigmas that `scale` is applied to."""
+    pairs = []
+    for density, steps in predictions:
+        widened = widen(density, scale)
+        mean, covariance = mixture.mean(widened), mixture.covariance(widened, coupling=coupling)
+        pairs.append(scale_error(np.asarray(mean, np.float64), np.asarray(covariance, np.float64), steps))
+    errors, variances = np.array(pairs).T
+    return errors, variances
 
 
 def _table(found: SigmaScale, before: StepScores, after: StepScores) -> Table:
@@ -132,6 +160,12 @@ def _table(found: SigmaScale, before: StepScores, after: StepScores) -> Table:
     notes = [f"NLL of these steps: {found.nll_before:.3f} before, {found.nll_after:.3f} after (nats a step, m and rad)"]
     if found.steps < _FEW_STEPS:
         notes.append(f"{found.steps} steps are few: a factor is known to some {100 / np.sqrt(2 * found.steps):.0f} %")
+    notes.append(
+        f"error of scale that a drive's steps share: {100 * found.scale_sigma:.1f} % (1 sigma, about zero), by maximum "
+        f"likelihood over {found.drives} drives"
+    )
+    if 0 < found.drives < _FEW_DRIVES:
+        notes.append(f"{found.drives} drives are few: it is known to some {100 / np.sqrt(2 * found.drives):.0f} %")
     names = ", ".join(found.fitted_on["sequences"])
     title = f"Sigma scale, fitted on {found.steps} steps of the training's validation split ({names})"
     return Table(title, columns, rows, notes=notes)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mdnvo_jax import evaluate as command
-from mdnvo_jax import predictor, recalibration
+from mdnvo_jax import geometry, predictor, recalibration
 from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig
 from mdnvo_jax.errors import InputError, exit_code
 from mdnvo_jax.evaluation import recalibrate
@@ -69,7 +69,8 @@ def run(*arguments):
 
 
 def some_scale():
-    return SigmaScale(SCALE, 10, 1.0, 0.5, {"split": "validation split of the training", "sequences": ["00"]})
+    about = {"split": "validation split of the training", "sequences": ["00"]}
+    return SigmaScale(SCALE, 10, 1.0, 0.5, about, scale_sigma=0.06, drives=3)
 
 
 def test_a_mixture_too_sure_by_two_is_widened_by_two():
@@ -90,6 +91,40 @@ def test_a_mixture_too_sure_by_two_is_widened_by_two():
     assert row["before_0"].value < 60
 
 
+def drives_too_sure_by_three(errors, steps):
+    """Predictions of drives with these errors of scale, 3 * 0.1 m a step beside it; they claim 0.1 m."""
+    rng = np.random.default_rng(4)
+    sigma = np.array([0.02, 0.02, 0.1, 0.01, 0.01, 0.01])
+    for error in errors:
+        mean = np.tile([0, 0, 1, 0, 0.01, 0.0], (steps, 1)) + sigma * rng.standard_normal((steps, 6))
+        truth = mean + 3 * sigma * rng.standard_normal((steps, 6))
+        truth[:, :3] += error * mean[:, :3]
+        yield Mixture(np.zeros((steps, 1)), mean[:, None], np.tile(np.log(sigma), (steps, 1, 1))), truth
+
+
+def test_errors_of_steps_do_not_pass_for_errors_of_scale():
+    names = {"sequences": [f"{i:02d}" for i in range(60)]}
+    found, _ = recalibrate.fit(list(drives_too_sure_by_three(np.zeros(60), 25)), "joint", names)
+    # Judged by what the drives claim, their 0.06 would be sqrt(0.06^2 - 0.02^2) too much.
+    assert np.std(found.fitted_on["scale_errors"]) == pytest.approx(0.06, rel=0.3)
+    assert found.scale_sigma < 0.03
+
+
+def test_the_error_of_scale_that_drives_share_is_found():
+    errors = 0.08 * np.random.default_rng(5).standard_normal(40)
+    parts = list(drives_too_sure_by_three(errors, 400))
+    found, table = recalibrate.fit(parts, "joint", {"sequences": [f"{i:02d}" for i in range(40)]})
+    np.testing.assert_allclose(found.scale, 3, rtol=0.1)
+    # Each is known to 3 * 0.1 / sqrt(400) of a metre a metre.
+    np.testing.assert_allclose(found.fitted_on["scale_errors"], errors, atol=4 * 0.015)
+    assert found.scale_sigma == pytest.approx(np.sqrt(np.mean(errors**2)), rel=0.1)
+    assert found.drives == 40
+    assert f"{100 * found.scale_sigma:.1f} % (1 sigma" in " ".join(table.notes)
+    assert "40 drives are few" not in " ".join(table.notes)
+    few = recalibrate.fit(parts[:3], "joint", {"sequences": ["a", "b", "c"]})[1]
+    assert "3 drives are few: it is known to some 41 %" in " ".join(few.notes)
+
+
 def test_the_command_fits_on_the_validation_split_alone(workdir, root, tmp_path, capsys):
     assert run("--checkpoint", workdir) == 0
     assert "14 steps" in capsys.readouterr().out
@@ -101,6 +136,9 @@ def test_the_command_fits_on_the_validation_split_alone(workdir, root, tmp_path,
     tails = recalibrate.validation_sequences(config, root=None, cache=None)
     assert stored["steps"] == sum(sequence.count - 1 for sequence in tails)
     assert stored["nll_after"] < stored["nll_before"]
+    # An untrained model is wrong by much the same on both.
+    assert stored["drives"] == 2
+    assert stored["scale_sigma"] > 0
     # A second time it has to be asked for, and the first factors do not enter.
     assert run("--checkpoint", workdir) == 2
     assert "--force" in capsys.readouterr().err
@@ -145,10 +183,23 @@ def test_every_sigma_is_multiplied_and_nothing_else(workdir, root, mode):
     np.testing.assert_allclose(after.sigma, SCALE * before.sigma, rtol=2e-5)
     np.testing.assert_allclose(after.steps, before.steps, atol=2e-6)
     assert after.about["sigma_scale"] == SCALE.tolist()
+    assert (before.scale_sigma, after.scale_sigma) == (0, 0.06)
+    # Of poses it is the scale's error that is added to those of the steps; one who knows better may say so.
+    own = predictor.predict(predictor.load(workdir), frames, mode=mode, scale_sigma=0.0)
+    added = after.covariance - own.covariance
+    np.testing.assert_allclose(added, geometry.scale_covariance(after.poses, 0.06), atol=1e-9)
     # The density has the same shape: its components are as many sigmas from the mean as they were.
     offsets = [(path.mixture.mean - path.steps[:, None]) / path.sigma[:, None] for path in (before, after)]
     np.testing.assert_allclose(offsets[1], offsets[0], atol=1e-4)
-    assert predictor.load(workdir, recalibrated=False).sigma_scale is None
+    without = predictor.load(workdir, recalibrated=False)
+    assert without.sigma_scale is None and without.scale_sigma == 0
+
+
+def test_an_impossible_error_of_scale_is_refused_before_the_work(workdir, root):
+    frames = str(root / "sequences" / "06" / "image_0")
+    never = predictor.load(workdir)._replace(features=None)
+    with pytest.raises(InputError, match="expected a share"):
+        predictor.predict(never, frames, scale_sigma=-1)
 
 
 def test_predict_can_do_without(workdir, root, tmp_path, monkeypatch):
@@ -159,7 +210,11 @@ def test_predict_can_do_without(workdir, root, tmp_path, monkeypatch):
     command = importlib.import_module("mdnvo_jax.predict")
     given = [root / "sequences" / "06" / "image_0", "--checkpoint", workdir, "--output", tmp_path / "out"]
     assert exit_code(command.main, [*map(str, given), "--no-recalibration"]) == 0
-    assert json.loads((tmp_path / "out" / "summary.json").read_text())["sigma_scale"] == "none"
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["sigma_scale"], summary["scale_sigma"]) == ("none", 0)
+    assert exit_code(command.main, [*map(str, given), "--force", "--scale-sigma", "0.11"]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["sigma_scale"], summary["scale_sigma"]) == (SCALE.tolist(), 0.11)
 
 
 def test_the_training_goes_on_beside_the_file(workdir):
@@ -183,6 +238,9 @@ def test_the_training_goes_on_beside_the_file(workdir):
         ({"scale": [1, 1, 1, 1, 1, float("nan")]}, "expected six factors"),
         ({"scale": "two"}, "damaged"),
         ({"steps": None}, "damaged"),
+        ({"scale_sigma": -0.1}, "expected 0 or more"),
+        ({"scale_sigma": float("nan")}, "expected 0 or more"),
+        ({"scale_sigma": None}, "damaged"),
     ],
 )
 def test_a_damaged_file_is_named(tmp_path, change, message):
@@ -192,6 +250,17 @@ def test_a_damaged_file_is_named(tmp_path, change, message):
     path.write_text(json.dumps({**stored, **change}))
     with pytest.raises(InputError, match=message):
         recalibration.read(tmp_path)
+
+
+def test_a_file_of_the_first_version_has_no_error_of_scale(tmp_path):
+    path = recalibration.write(tmp_path, some_scale())
+    assert (recalibration.read(tmp_path).scale_sigma, recalibration.read(tmp_path).drives) == (0.06, 3)
+    stored = json.loads(path.read_text())
+    path.write_text(
+        json.dumps({k: v for k, v in stored.items() if k not in ("scale_sigma", "drives")} | {"version": 1})
+    )
+    found = recalibration.read(tmp_path)
+    assert (found.scale_sigma, found.drives, found.scale.tolist()) == (0, 0, SCALE.tolist())
 
 
 def test_no_step_no_fit():

@@ -1,0 +1,63 @@
+"""How far predicted drives are too short or too long as a whole, and what is to be expected of other drives."""
+
+import numpy as np
+
+from mdnvo_jax.evaluation import optional
+
+# Relative standard deviations that `fit_scale_sigma` considers, beside none at all.
+_LEAST_SIGMA, _GREATEST_SIGMA = 1e-4, 4.0
+
+
+def scale_error(steps: np.ndarray, covariance: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
+    """Relative error of scale of one drive, by weighted least squares, and its variance.
+
+    Of predicted translations p_k and true ones t_k = (1 + e) p_k + n_k with independent n_k ~ N(0, C_k),
+
+        e = sum_k p_k^T C_k^-1 (t_k - p_k) / sum_k p_k^T C_k^-1 p_k,   variance 1 / sum_k p_k^T C_k^-1 p_k.
+
+    Errors of steps that are alike for a while count as scale as far as they do not average out over the drive, as they
+    must: `odometry.trajectory` treats all that is not scale as independent.
+
+    Args:
+      steps: predicted, `[n, 6]`, or their translations `[n, 3]`, m.
+      covariance: of those, `[n, 6, 6]` or `[n, 3, 3]`.
+      truth: of the shape of `steps`.
+
+    Returns:
+      (error, variance); (0, infinity) for a drive that is predicted to stand still, which tells nothing.
+    """
+    predicted, residual = steps[:, :3], (truth - steps)[:, :3]
+    weighted = np.linalg.solve(covariance[:, :3, :3], predicted[..., None])[..., 0]
+    precision = float((weighted * predicted).sum())
+    if precision == 0:
+        return 0.0, float("inf")
+    return float((weighted * residual).sum()) / precision, 1 / precision
+
+
+def fit_scale_sigma(errors: np.ndarray, variances: np.ndarray) -> float:
+    """Standard deviation s of the scale's error over drives, by maximum likelihood of e_i ~ N(0, s^2 + v_i).
+
+    About zero and not about the mean: what all drives are wrong by is wrong in the next one, too. Drives weigh by what
+    they tell, those with an infinite variance nothing; 0 where the variances alone explain the errors, or
+    nothing is told. Below 4.
+
+    Args:
+      errors: of the drives, `[n]`.
+      variances: of those, `[n]`, above 0; see `scale_error`.
+    """
+    optimize = optional.load("scipy.optimize")
+    told = np.isfinite(variances)
+    errors, variances = errors[told], variances[told]
+    if len(errors) == 0:
+        return 0.0
+
+    def nll(log_sigma: float) -> float:
+        total = np.exp(2 * log_sigma) + variances
+        return float((np.log(total) + errors**2 / total).sum() / 2)
+
+    # The grid first: there may be several optima.
+    grid = np.linspace(np.log(_LEAST_SIGMA), np.log(_GREATEST_SIGMA), 49)
+    nearest = int(np.argmin([nll(point) for point in grid]))
+    bounds = grid[max(nearest - 1, 0)], grid[min(nearest + 1, len(grid) - 1)]
+    best = optimize.minimize_scalar(nll, bounds=bounds, method="bounded").x
+    return float(np.exp(best)) if nll(best) < nll(-np.inf) else 0.0
