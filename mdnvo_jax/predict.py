@@ -25,6 +25,12 @@ def main(arguments: Sequence[str]) -> None:
     parser.add_argument("--stride", type=int, default=1, metavar="N", help="use every Nth frame")
     parser.add_argument("--timestamps", metavar="FILE", help="a time in seconds a line, one for each frame")
     parser.add_argument("--camera", type=intrinsics, metavar="fx,fy,cx,cy", help="intrinsics of the frames in pixels")
+    parser.add_argument(
+        "--camera-height",
+        type=float,
+        metavar="METRES",
+        help="height of the optical centre above the road surface; translations scale with it [that of the training]",
+    )
     parser.add_argument("--mode", choices=("offline", "streaming"), default="offline", help="streaming: past alone")
     parser.add_argument("--bad-frames", choices=("stop", "hold"), default="stop", help="what an unreadable frame does")
     parser.add_argument(
@@ -62,6 +68,7 @@ def main(arguments: Sequence[str]) -> None:
     model = predictor.load(
         options.checkpoint,
         recalibrated=not options.no_recalibration,
+        camera_height_m=options.camera_height,
         backend=options.backend,
         precision=options.precision,
     )

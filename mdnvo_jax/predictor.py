@@ -27,6 +27,7 @@ from mdnvo_jax.mixture import Mixture
 from mdnvo_jax.model import fold
 from mdnvo_jax.model.convolution import Products
 from mdnvo_jax.model.fold import Folded
+from mdnvo_jax.model.head import Labels
 from mdnvo_jax.model.network import build
 from mdnvo_jax.odometry import Estimate, Trajectory, check_scale_sigma, trajectory
 from mdnvo_jax.streaming import Stream, StreamStep, stream
@@ -58,6 +59,7 @@ class Predictor(NamedTuple):
       sigma_scale: factors by component that every sigma is multiplied by already, `[6]`; None where none were fitted.
       scale_sigma: relative standard deviation of the error of scale that the steps of a run share; 0 where none was
         fitted. It belongs to absolute poses, see `odometry.trajectory`; what is said of single steps is without it.
+      camera_height_m: height of the camera that translations are for, where `load` was told one.
     """
 
     config: Config
@@ -71,12 +73,14 @@ class Predictor(NamedTuple):
     precision: Precision
     sigma_scale: np.ndarray | None = None
     scale_sigma: float = 0.0
+    camera_height_m: float | None = None
 
 
 def load(
     path: str | os.PathLike[str],
     *,
     recalibrated: bool = True,
+    camera_height_m: float | None = None,
     backend: Backend = "jax",
     precision: Precision = "float32",
 ) -> Predictor:
@@ -86,13 +90,14 @@ def load(
       path: the folder.
       recalibrated: use what `evaluate recalibrate` left with the checkpoint, if it has: factors for every sigma, and
         the error of scale.
+      camera_height_m: of the camera's optical centre above the road; None: as in the training. See `at_camera_height`.
       backend: what computes the convolutions. "openvino" is for processors; where it is not installed JAX computes
         them, and a line on stderr says so. The LSTM and the head are JAX's always.
       precision: of the products in the convolutions; all else is float32. On a processor, "bfloat16" means something
         to OpenVINO alone.
 
     Raises:
-      InputError: there is none, or it is damaged.
+      InputError: there is none, or it is damaged, or was trained without a known height of the camera.
     """
     model, config, folder = trained(path)
     found = recalibration.read(folder) if recalibrated else None
@@ -104,6 +109,7 @@ def load(
         precision=precision,
         sigma_scale=None if found is None else found.scale,
         scale_sigma=0.0 if found is None else found.scale_sigma,
+        camera_height_m=camera_height_m,
     )
 
 
@@ -123,6 +129,42 @@ def trained(path: str | os.PathLike[str]) -> tuple[Model, Config, Path]:
     return checkpoint.read_model(folder, checkpoint.abstract(template, here)), config, folder
 
 
+def at_camera_height(model: Model, config: Config, height_m: float) -> tuple[Model, Config]:
+    """Return a model and its experiment in the metres of a camera at another height above the road.
+
+    A camera sees the ground up to scale: at twice the height, twice the motion gives the same frames. So the density of
+    a translation t becomes that of t h / h0, where h0 is `data.camera_height_m`; rotation stays as it is. The network's
+    outputs are in units of the labels' deviation, so that scaling mean and deviation of the labels, and the floor of
+    sigma, does all of it: in windows, in streams, for held steps and in what is exported.
+
+    Args:
+      model: as trained.
+      config: the experiment; its `data.camera_height_m` says what the labels stand for.
+      height_m: of the camera's optical centre above the road surface.
+
+    Raises:
+      InputError: `height_m` is no length, or the height that the model was trained for is not known.
+    """
+    if not (np.isfinite(height_m) and height_m > 0):
+        raise InputError(f"the camera's height is {height_m}: expected metres above the road, such as 1.65")
+    trained_for = config.data.camera_height_m
+    if not trained_for:
+        raise InputError(
+            f"the camera's height is given, {height_m:g} m, but these weights were trained without a known one "
+            "(data.camera_height_m is 0): leave the height out, and scale the trajectory by what you know"
+        )
+    ratio = height_m / trained_for
+    factors = np.array([ratio] * 3 + [1.0] * 3, np.float32)
+    labels = Labels(*(jnp.asarray(values) * factors for values in model.labels))
+    floor_m = config.model.translation_floor_m * ratio
+    config = dataclasses.replace(
+        config,
+        model=dataclasses.replace(config.model, translation_floor_m=floor_m),
+        data=dataclasses.replace(config.data, camera_height_m=height_m),
+    )
+    return model._replace(labels=labels), config
+
+
 def from_model(
     model: Model,
     config: Config,
@@ -132,8 +174,11 @@ def from_model(
     precision: Precision = "float32",
     sigma_scale: np.ndarray | None = None,
     scale_sigma: float = 0.0,
+    camera_height_m: float | None = None,
 ) -> Predictor:
     """Return a predictor of a model in memory; the arguments are those of `load` and `Predictor`."""
+    if camera_height_m is not None:
+        model, config = at_camera_height(model, config, camera_height_m)
     backend = backends.available(backend)
     stack = fold.fold_stack(model.params["stack"], model.batch_stats["stack"])
     scale = None if sigma_scale is None else jnp.asarray(sigma_scale, jnp.float32)
@@ -168,6 +213,7 @@ def from_model(
         precision=precision,
         sigma_scale=sigma_scale,
         scale_sigma=scale_sigma,
+        camera_height_m=camera_height_m,
     )
 
 
@@ -267,6 +313,7 @@ def predict(
         "precision": predictor.precision,
         "sigma_scale": "none" if predictor.sigma_scale is None else predictor.sigma_scale.tolist(),
         "camera": "given" if sequence.camera else "unknown: the whole frame is taken to be the training camera's",
+        "camera_height_m": predictor.camera_height_m or _trained_height(predictor.config),
         "start_s": round(seconds.pop("start"), 3),
         "ms_per_frame": {stage: round(1e3 * total / sequence.count, 3) for stage, total in seconds.items()},
     }
@@ -294,6 +341,12 @@ def _frame_size(sequence: Sequence) -> tuple[int, int] | None:
             height, width = sequence.read(index).shape[:2]
             return height, width
     return None
+
+
+def _trained_height(config: Config) -> str:
+    """Return what the summary says of a height that nobody gave."""
+    height_m = config.data.camera_height_m
+    return f"not given: {height_m:g} as in the training" if height_m else "not given, and unknown in the training"
 
 
 def _warm_up(predictor: Predictor, mode: Mode, size: int, hop: int) -> None:

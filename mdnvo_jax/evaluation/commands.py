@@ -48,6 +48,7 @@ def parser() -> Parser:
     add("--checkpoint", required=True, metavar="DIR", help="the --workdir of a training")
     add("--camera-folder", metavar="NAME", help="such as image_2 [that of the training]")
     add("--nuscenes-version", metavar="NAME", help="such as v1.0-mini [that of the training]")
+    add("--camera-height", type=float, metavar="METRES", help="of its camera above the road [that of the training]")
     add("--mode", choices=("offline", "streaming"), default="offline", help="streaming: past alone [%(default)s]")
     add("--estimate", choices=("mean", "strongest"), default="mean", help="what a mixture is reported by [%(default)s]")
     add("--no-recalibration", action="store_true", help="sigmas as the network gave them")

@@ -51,7 +51,9 @@ def from_options(options: argparse.Namespace) -> Report:
 
     if options.block < 1:
         raise InputError(f"--block is {options.block}: expected 1 frame or more")
-    model = predictor.load(options.checkpoint, recalibrated=not options.no_recalibration)
+    model = predictor.load(
+        options.checkpoint, recalibrated=not options.no_recalibration, camera_height_m=options.camera_height
+    )
     predicted = []
     for sequence in sequences(options, model.config):
         if sequence.poses is None or sequence.count < 2:
