@@ -158,6 +158,9 @@ class TrainingConfig:
     kappa: float = 100.0
     # Stack parameters made by bin/convert_flownet; empty: Xavier everywhere. Paper: FlowNet.
     initial_stack: str = ""
+    # Start from the whole of another training: "shipped" for the weights of the package, or a checkpoint's folder. Its
+    # statistics of the labels, which are the units of the outputs, are taken over. Empty: from scratch.
+    initial_weights: str = ""
     # Checkpoints to keep: the newest ones, beside the best.
     keep_latest: int = 2
 

@@ -46,10 +46,10 @@ def trained() -> Model:
     return initial_state(variables, CONFIG, LABELS).model
 
 
-def save(folder: Path) -> Path:
-    """Write the model as a training does, and return the folder."""
+def save(folder: Path, config: Config = CONFIG) -> Path:
+    """Write the model as a training of `config`, which has the network of `CONFIG`, does, and return the folder."""
     store = checkpoint.Store(folder, keep_latest=1)
     variables = initial_variables(build(CONFIG.image, CONFIG.model), CONFIG)
-    store.save(initial_state(variables, CONFIG, LABELS)._replace(model=trained()), None, CONFIG, 1.0)
+    store.save(initial_state(variables, CONFIG, LABELS)._replace(model=trained()), None, config, 1.0)
     store.close()
     return folder

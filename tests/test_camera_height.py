@@ -125,8 +125,7 @@ def test_the_command_says_when_the_training_knew_no_height(
 def test_the_command_scales(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for picture in ("trajectory", "uncertainty"):
         monkeypatch.setattr(f"mdnvo_jax.evaluation.plots.plot_{picture}", lambda *_: None)
-    monkeypatch.setattr("small_model.CONFIG", KNOWN)
-    step = checkpoint.locate(save_model(tmp_path / "run"))
+    step = checkpoint.locate(save_model(tmp_path / "run", KNOWN))
     command = importlib.import_module("mdnvo_jax.predict")
     given = [str(folder), "--bad-frames", "hold", "--checkpoint", str(step)]
     distances = []

@@ -12,14 +12,18 @@ import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers
 
 from mdnvo_jax import config as configuration
+from mdnvo_jax import files
 from mdnvo_jax.config import Config
 from mdnvo_jax.errors import InputError
-from mdnvo_jax.training.state import Model, State
+from mdnvo_jax.model.network import build
+from mdnvo_jax.training.state import Model, State, state_template
 
 # Raised when what is stored, or its meaning, changes.
 VERSION = 1
 FOLDER = "checkpoints"
 _METRIC = "validation_loss"
+# What orbax calls the one file of a JSON item.
+_JSON_FILE = "metadata"
 # What orbax raises for a checkpoint that is damaged, incomplete or of another shape.
 _DAMAGE = (ValueError, KeyError, OSError, TypeError)
 
@@ -64,7 +68,7 @@ class Store:
                 model=ocp.args.StandardSave(state.model),
                 training=ocp.args.StandardSave(_without_model(state)),
                 data=ocp.args.JsonSave({"iterator": data_state}),
-                about=ocp.args.JsonSave({"version": VERSION, "config": json.loads(configuration.as_json(config))}),
+                about=ocp.args.JsonSave(_about(config)),
             ),
             metrics={_METRIC: validation_loss},
         )
@@ -108,6 +112,11 @@ class Store:
     def close(self) -> None:
         """Finish what is being written and let go."""
         self._manager.close()
+
+
+def _about(config: Config) -> dict[str, Any]:
+    """Return what a checkpoint says about itself."""
+    return {"version": VERSION, "config": json.loads(configuration.as_json(config))}
 
 
 def _without_model(state: State) -> dict[str, Any]:
@@ -177,6 +186,27 @@ def read_config(step_folder: Path) -> Config:
             "use the release of mdnvo_jax that wrote it"
         )
     return configuration.from_json(json.dumps(about["config"]))
+
+
+def write_about(step_folder: Path, config: Config) -> None:
+    """Put another experiment into a copy of a step's folder, for `read_config`."""
+    files.write_text(step_folder / "about" / _JSON_FILE, json.dumps(_about(config)))
+
+
+def trained(path: str | os.PathLike[str]) -> tuple[Model, Config, Path]:
+    """Return the model in a checkpoint as it was trained, the experiment, and the folder of the step.
+
+    Args:
+      path: the --workdir of a training, whose best step is taken, or the folder of one step.
+
+    Raises:
+      InputError: there is none, or it is damaged.
+    """
+    folder = locate(path)
+    config = read_config(folder)
+    template = state_template(build(config.image, config.model), config).model
+    here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    return read_model(folder, abstract(template, here)), config, folder
 
 
 def read_model(step_folder: Path, template: Model) -> Model:

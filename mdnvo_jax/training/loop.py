@@ -17,17 +17,15 @@ from mdnvo_jax import config as configuration
 from mdnvo_jax import files
 from mdnvo_jax.config import Config
 from mdnvo_jax.data.load import load_split
-from mdnvo_jax.data.windows import batches_per_epoch, label_statistics, training_batches, validation_batches
+from mdnvo_jax.data.windows import batches_per_epoch, training_batches, validation_batches
 from mdnvo_jax.errors import InputError
-from mdnvo_jax.model.flownet import load_stack
 from mdnvo_jax.model.head import Labels
 from mdnvo_jax.model.network import Network, build
-from mdnvo_jax.training import checkpoint, logs, parallel, step
+from mdnvo_jax.training import checkpoint, initial, logs, parallel, step
 from mdnvo_jax.training.state import (
     TRAIN_METRICS,
     State,
     initial_state,
-    initial_variables,
     schedule_scale,
     state_template,
 )
@@ -90,6 +88,8 @@ def train(config: Config, workdir: Path, *, resume: bool = False) -> str:
       Stopped: SIGTERM or SIGINT ended it; a checkpoint of the last step is kept.
     """
     _check_loss(config)
+    if not resume:
+        initial.check(config)
     _claim(workdir, resume)
     train_set, validation_set, image = load_split(config)
     config = dataclasses.replace(config, image=image)
@@ -107,8 +107,8 @@ def train(config: Config, workdir: Path, *, resume: bool = False) -> str:
         state = restored.state
         batches.set_state(restored.data_state)
     else:
-        labels = Labels(*map(jax.numpy.asarray, label_statistics(train_set, config.data)))
-        state = jax.device_put(initial_state(_first_variables(network, config), config, labels), everywhere)
+        variables, labels = initial.start(network, config, train_set)
+        state = jax.device_put(initial_state(variables, config, labels), everywhere)
         _describe(workdir, config, labels)
     run = _Run(config, workdir, network, mesh, store, steps_per_epoch, int(state.step))
     try:
@@ -154,20 +154,6 @@ def _check_same(config: Config, workdir: Path) -> None:
             f"{', '.join(different)} differ from {workdir / 'config.json'}: "
             "resume with the same configuration (only training.epochs may change), or train in another --workdir"
         )
-
-
-def _first_variables(network: Network, config: Config) -> Any:
-    """Return the variables to start from, with the stack's weights from a file where the config names one."""
-    variables = initial_variables(network, config)
-    if not config.training.initial_stack:
-        return variables
-    if config.image.normalisation != "flownet":
-        print(
-            f"warning: image.normalisation is {config.image.normalisation!r}: FlowNet's weights were trained on frames "
-            "normalised by 'flownet'",
-            file=sys.stderr,
-        )
-    return load_stack(config.training.initial_stack, variables)
 
 
 def _describe(workdir: Path, config: Config, labels: Labels) -> None:
