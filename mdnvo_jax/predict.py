@@ -1,4 +1,4 @@
-"""Estimate a trajectory with covariance: `python -m mdnvo_jax.predict IMAGES --checkpoint DIR --output DIR`."""
+"""Estimate a trajectory with covariance: `python -m mdnvo_jax.predict IMAGES --output DIR`."""
 
 import json
 import shlex
@@ -19,7 +19,7 @@ def main(arguments: Sequence[str]) -> None:
         metavar="IMAGES",
         help="a folder, a glob in quotes, a video, or a KITTI sequence (such as image_0 with a calib.txt beside it)",
     )
-    parser.add_argument("--checkpoint", required=True, metavar="DIR", help="the --workdir of a training")
+    parser.add_argument("--checkpoint", metavar="DIR", help="the --workdir of a training [weights of the package]")
     parser.add_argument("--output", required=True, metavar="DIR", help="the files are written here")
     parser.add_argument("--force", action="store_true", help="overwrite files in --output")
     parser.add_argument("--stride", type=int, default=1, metavar="N", help="use every Nth frame")

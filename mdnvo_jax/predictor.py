@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from mdnvo_jax import backend as backends
-from mdnvo_jax import offline, recalibration
+from mdnvo_jax import offline, recalibration, weights
 from mdnvo_jax.backend import Backend, Precision
 from mdnvo_jax.config import Config, ImageConfig
 from mdnvo_jax.data import ahead, images
@@ -28,11 +28,10 @@ from mdnvo_jax.model import fold
 from mdnvo_jax.model.convolution import Products
 from mdnvo_jax.model.fold import Folded
 from mdnvo_jax.model.head import Labels
-from mdnvo_jax.model.network import build
 from mdnvo_jax.odometry import Estimate, Trajectory, check_scale_sigma, trajectory
 from mdnvo_jax.streaming import Stream, StreamStep, stream
 from mdnvo_jax.training import checkpoint
-from mdnvo_jax.training.state import Model, state_template
+from mdnvo_jax.training.state import Model
 
 Mode = Literal["offline", "streaming"]
 # Frames whose results are not waited for while streaming from files.
@@ -77,7 +76,7 @@ class Predictor(NamedTuple):
 
 
 def load(
-    path: str | os.PathLike[str],
+    path: str | os.PathLike[str] | None = None,
     *,
     recalibrated: bool = True,
     camera_height_m: float | None = None,
@@ -87,7 +86,7 @@ def load(
     """Return the model in a checkpoint: the best step of a training's --workdir, or the folder of one step.
 
     Args:
-      path: the folder.
+      path: the folder; None for the weights that ship with the package.
       recalibrated: use what `evaluate recalibrate` left with the checkpoint, if it has: factors for every sigma, and
         the error of scale.
       camera_height_m: of the camera's optical centre above the road; None: as in the training. See `at_camera_height`.
@@ -113,7 +112,7 @@ def load(
     )
 
 
-def trained(path: str | os.PathLike[str]) -> tuple[Model, Config, Path]:
+def trained(path: str | os.PathLike[str] | None = None) -> tuple[Model, Config, Path]:
     """Return the model in a checkpoint as it was trained, the experiment, and the folder of the step.
 
     Args:
@@ -122,11 +121,7 @@ def trained(path: str | os.PathLike[str]) -> tuple[Model, Config, Path]:
     Raises:
       InputError: there is none, or it is damaged.
     """
-    folder = checkpoint.locate(path)
-    config = checkpoint.read_config(folder)
-    template = state_template(build(config.image, config.model), config).model
-    here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    return checkpoint.read_model(folder, checkpoint.abstract(template, here)), config, folder
+    return checkpoint.trained(weights.folder() if path is None else path)
 
 
 def at_camera_height(model: Model, config: Config, height_m: float) -> tuple[Model, Config]:

@@ -20,7 +20,10 @@ def main() -> None:
     import mdnvo_jax
 
     checkout = Path(__file__).resolve().parents[1]
-    assert not Path(mdnvo_jax.__file__).is_relative_to(checkout), f"{mdnvo_jax.__file__} is not the installed wheel"
+    installed = Path(mdnvo_jax.__file__).parent
+    assert not installed.is_relative_to(checkout), f"{mdnvo_jax.__file__} is not the installed wheel"
+    shipped = weights_in(checkout / "mdnvo_jax")
+    assert weights_in(installed) == shipped, "the wheel holds other weights than the checkout"
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         (folder / "config.py").write_text(CONFIG)
@@ -47,7 +50,17 @@ def main() -> None:
         run("predict", "drives/sequences/00", "--checkpoint", "train", "--output", "result")
         run("evaluate", "trajectory", "result", "--reference", "drives/poses/00.txt", "--output", "evaluation")
         assert len((folder / "result" / "trajectory_kitti.txt").read_text().splitlines()) == 12
-    print("wheel: installed, trained, predicted and evaluated outside the checkout")
+        if shipped:
+            run("predict", "drives/sequences/00", "--output", "shipped")
+            assert len((folder / "shipped" / "trajectory_kitti.txt").read_text().splitlines()) == 12
+    with_weights = "and predicted with its own weights" if shipped else "(no weights ship with it)"
+    print(f"wheel: installed, trained, predicted and evaluated outside the checkout {with_weights}")
+
+
+def weights_in(package: Path) -> dict[str, bytes]:
+    """Return the files of the shipped weights by name."""
+    folder = package / "weights" / "pretrained"
+    return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 if __name__ == "__main__":

@@ -45,7 +45,7 @@ def parser() -> Parser:
         metavar="NAME",
         help="such as 03 05, scene-0768, or seeds of synthetic worlds",
     )
-    add("--checkpoint", required=True, metavar="DIR", help="the --workdir of a training")
+    add("--checkpoint", metavar="DIR", help="the --workdir of a training [the weights of the package]")
     add("--camera-folder", metavar="NAME", help="such as image_2 [that of the training]")
     add("--nuscenes-version", metavar="NAME", help="such as v1.0-mini [that of the training]")
     add("--camera-height", type=float, metavar="METRES", help="of its camera above the road [that of the training]")
