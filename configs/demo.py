@@ -1,4 +1,4 @@
-"""A tiny network on a few rendered drives: the whole pipeline in a few minutes, for `bin/demo`.
+"""A tiny network on a few rendered drives: a whole training in a few minutes, to see how it goes.
 
     python -m mdnvo_jax.synthesize drives --sequences 24 --frames 60 --seed 0 --height 48 --width 160
     python -m mdnvo_jax.train configs/demo.py --workdir train --data.root drives
