@@ -129,6 +129,8 @@ def _about(predictor: Predictor, start: dict[str, jax.Array], results: dict[str,
         "sigma_scale": None if predictor.sigma_scale is None else predictor.sigma_scale.tolist(),
         "scale_sigma": predictor.scale_sigma,
         "scale_sigma_is": "relative, 1 sigma, of all translations of a run together: belongs to poses, not to steps",
+        "step_correlation": None if predictor.correlation is None else predictor.correlation.tolist(),
+        "step_correlation_is": "of the errors of any two steps of a run, by component; for covariances of poses, too",
         "checkpoint": predictor.source,
         "versions": {"mdnvo_jax": mdnvo_jax.__version__, "jax": jax.__version__},
     }

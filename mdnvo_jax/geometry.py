@@ -201,15 +201,17 @@ def relative_steps(poses: Array) -> Array:
 
 
 def step_covariance_to_perturbation(step: Array, covariance: Array) -> Array:
-    """Covariance of a step's vector to covariance of its right perturbation, both `[..., 6, 6]`; to first order.
-
-    Moving the step `[..., 6]` by (dt, dr) is the perturbation xi = (R^T dt, J_r(r) dr).
-    """
+    """Covariance of a step's vector to covariance of its right perturbation, both `[..., 6, 6]`; to first order."""
     xp, step, covariance = _inputs((step, (6,)), (covariance, (6, 6)))
+    return _sandwich(xp, step_jacobian(step), covariance)
+
+
+def step_jacobian(step: Array) -> Array:
+    """`[..., 6, 6]`: moving the step `[..., 6]` by (dt, dr) is the right perturbation (R^T dt, J_r(r) dr)."""
+    xp, step = _inputs((step, (6,)))
     rotation = step[..., 3:]
     zero = xp.zeros_like(hat(rotation))
-    moved = _blocks(xp, exp_so3(-rotation), zero, zero, right_jacobian_so3(rotation))
-    return _sandwich(xp, moved, covariance)
+    return _blocks(xp, exp_so3(-rotation), zero, zero, right_jacobian_so3(rotation))
 
 
 def propagate_covariance(
@@ -278,6 +280,19 @@ def scale_covariance(poses: Array, sigma: float) -> Array:
     moved = _apply(_transpose(poses[..., :3, :3]), poses[..., :3, 3] - poses[..., :1, :3, 3])
     direction = sigma * xp.concatenate([moved, xp.zeros_like(moved)], axis=-1)
     return direction[..., :, None] * direction[..., None, :]
+
+
+def shared_covariance(poses: Array, directions: Array) -> Array:
+    """Covariance `[..., N + 1, 6, 6]` that errors which all steps share give the poses `[..., N + 1, 4, 4]` of a path.
+
+    The right perturbation of step k is D_k e, with one e ~ N(0, I) for the whole path; D `[..., N, 6, M]`. To first
+    order that of pose j is J_j e with J_j = Ad(T_j^-1) sum_{k <= j} Ad(T_k) D_k, and its covariance J_j J_j^T.
+    """
+    xp, poses, directions = _inputs((poses, (None, 4, 4)), (directions, (None, 6, None)))
+    in_world = xp.cumsum(_matmul(xp, adjoint(poses[..., 1:, :, :]), directions), axis=-3)
+    jacobian = _matmul(xp, adjoint(inverse(poses[..., 1:, :, :])), in_world)
+    zero = xp.zeros_like(poses[..., :1, :1, :1]) * xp.zeros((6, 6), poses.dtype)
+    return xp.concatenate([zero, _matmul(xp, jacobian, _transpose(jacobian))], axis=-3)
 
 
 def _then(earlier: tuple[Any, Any], later: tuple[Any, Any]) -> tuple[Any, Any]:

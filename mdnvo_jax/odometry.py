@@ -27,7 +27,7 @@ class Trajectory:
     Attributes:
       poses: `[N, 4, 4]`, `T_world_camera`; the first is the identity.
       covariance: `[N, 6, 6]`, of a right perturbation of each pose, `T = T_mean @ exp(xi)`; the first is zero. It holds
-        the errors of the steps, as if they were independent, and that of the scale.
+        what steps are wrong by, each by itself and all together.
       steps: `[N-1, 6]`, the relative poses as (tx, ty, tz, rx, ry, rz).
       step_covariance: `[N-1, 6, 6]`, covariance of those vectors: of a step by itself, whatever its errors come from.
       timestamps: `[N]` s; frame numbers where the source has none.
@@ -35,6 +35,7 @@ class Trajectory:
       mixture: the density of each step, `[N-1, M]` and `[N-1, M, 6]`.
       coupling: how that density combines its dimensions.
       scale_sigma: relative standard deviation of the error of scale that all steps share; see `trajectory`.
+      correlation: of the errors of any two steps, by component, `[6]`; see `trajectory`.
       about: what else belongs in summary.json.
     """
 
@@ -47,6 +48,7 @@ class Trajectory:
     mixture: Mixture
     coupling: Coupling
     scale_sigma: float = 0.0
+    correlation: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(6))
     about: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     @property
@@ -93,14 +95,21 @@ def trajectory(
     estimate: Estimate = "mean",
     order: Literal[1, 2] = 1,
     scale_sigma: float = 0.0,
+    correlation: np.ndarray | None = None,
 ) -> Trajectory:
     """Integrate the densities of consecutive steps (equation 8) and propagate their covariance.
 
-    Errors of steps average out along the path as far as they are independent. What all steps of a run are wrong by, a
-    scale that is off because the road, the lens or the mount is unlike the training's, does not:
-    `geometry.scale_covariance` says what it adds to the covariance of poses. The steps stay as they are, for their
-    sigmas are meant to hold for each step by itself, an error of scale included. So its share in a single step is in a
-    pose's covariance twice, once as if independent: of n steps alike that is at most one part in n of the scale's term.
+    Errors of steps average out along the path as far as they are independent. What all steps of a run are wrong by
+    together, because the road, the lens or the mount is unlike the training's, does not. Two kinds of it are known:
+
+    - A scale that is off: true translations are (1 + e) times the given ones, e ~ N(0, scale_sigma^2).
+    - Errors of component k of any two steps that have the correlation rho_k: of its variance sigma_k^2 the share rho_k
+      is one error for the whole run, in units of sigma_k, and the rest is independent from step to step.
+
+    They are in the covariance of poses (`geometry.scale_covariance`, `geometry.shared_covariance`). The steps and their
+    sigmas stay as they are: they are meant to hold for each step by itself, whatever its error comes from. So the
+    scale's share in a single step is in a pose's covariance twice, once as if independent: of n steps alike that is at
+    most one part in n of the scale's term.
 
     Args:
       steps: logits `[N-1, M]`, mean and log_scale `[N-1, M, 6]`, in metres and radians.
@@ -110,25 +119,34 @@ def trajectory(
       estimate: "mean" and covariance of the whole mixture (law of total variance), or those of the "strongest"
         component.
       order: of the covariance propagation, 1 or 2; see `geometry.propagate_covariance`.
-      scale_sigma: true translations are (1 + e) times those of the steps, with one e of this standard deviation.
+      scale_sigma: see above, 0 or more.
+      correlation: rho of each component, `[6]`, from 0 to 1; None for independent steps.
 
     Raises:
       InputError: `scale_sigma` is no number of 0 or more.
+      ValueError: `correlation` is not of that shape or range.
     """
     check_scale_sigma(scale_sigma)
+    correlation = np.zeros(6) if correlation is None else np.asarray(correlation, np.float64)
+    if correlation.shape != (6,) or not ((correlation >= 0) & (correlation <= 1)).all():
+        raise ValueError(f"correlation is {correlation}: expected six numbers from 0 to 1")
     leaves: list[Any] = [np.asarray(leaf, np.float64) for leaf in steps]
     steps = Mixture(*leaves)
     reported = mixture.strongest(steps) if estimate == "strongest" else steps
     vectors = np.asarray(mixture.mean(reported), np.float64)
     covariance = np.asarray(mixture.covariance(reported, coupling=coupling), np.float64)
     matrices = geometry.step_to_matrix(vectors)
-    perturbation = geometry.step_covariance_to_perturbation(vectors, covariance)
+    alone = np.sqrt(1 - correlation)
+    perturbation = geometry.step_covariance_to_perturbation(vectors, alone[:, None] * covariance * alone)
+    together = np.sqrt(correlation * np.diagonal(covariance, axis1=-2, axis2=-1))
     count = len(vectors) + 1
     poses = np.asarray(geometry.accumulate(matrices))
     propagated = np.asarray(geometry.propagate_covariance(matrices, perturbation, order=order))
     return Trajectory(
         poses=poses,
-        covariance=propagated + geometry.scale_covariance(poses, scale_sigma),
+        covariance=propagated
+        + geometry.scale_covariance(poses, scale_sigma)
+        + geometry.shared_covariance(poses, geometry.step_jacobian(vectors) * together[:, None, :]),
         steps=vectors,
         step_covariance=covariance,
         timestamps=np.arange(count, dtype=np.float64) if timestamps is None else np.asarray(timestamps, np.float64),
@@ -136,6 +154,7 @@ def trajectory(
         mixture=steps,
         coupling=coupling,
         scale_sigma=float(scale_sigma),
+        correlation=correlation,
         about={"estimate": estimate, "timestamps": "frame numbers" if timestamps is None else "given"},
     )
 
@@ -228,5 +247,6 @@ def _summary(path: Trajectory) -> dict[str, Any]:
         "flagged_steps": sum(bool(flag) for flag in path.flags),
         "coupling": path.coupling,
         "scale_sigma": path.scale_sigma,
+        "step_correlation": dict(zip(COMPONENTS, path.correlation.tolist(), strict=True)),
         **path.about,
     }

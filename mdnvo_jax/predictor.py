@@ -58,6 +58,7 @@ class Predictor(NamedTuple):
       sigma_scale: factors by component that every sigma is multiplied by already, `[6]`; None where none were fitted.
       scale_sigma: relative standard deviation of the error of scale that the steps of a run share; 0 where none was
         fitted. It belongs to absolute poses, see `odometry.trajectory`; what is said of single steps is without it.
+      correlation: of the errors of any two steps, by component, `[6]`; likewise. None where none was fitted.
       camera_height_m: height of the camera that translations are for, where `load` was told one.
     """
 
@@ -72,6 +73,7 @@ class Predictor(NamedTuple):
     precision: Precision
     sigma_scale: np.ndarray | None = None
     scale_sigma: float = 0.0
+    correlation: np.ndarray | None = None
     camera_height_m: float | None = None
 
 
@@ -88,7 +90,7 @@ def load(
     Args:
       path: the folder; None for the weights that ship with the package.
       recalibrated: use what `evaluate recalibrate` left with the checkpoint, if it has: factors for every sigma, and
-        the error of scale.
+        what steps are wrong by together.
       camera_height_m: of the camera's optical centre above the road; None: as in the training. See `at_camera_height`.
       backend: what computes the convolutions. "openvino" is for processors; where it is not installed JAX computes
         them, and a line on stderr says so. The LSTM and the head are JAX's always.
@@ -108,6 +110,7 @@ def load(
         precision=precision,
         sigma_scale=None if found is None else found.scale,
         scale_sigma=0.0 if found is None else found.scale_sigma,
+        correlation=None if found is None else found.correlation,
         camera_height_m=camera_height_m,
     )
 
@@ -169,6 +172,7 @@ def from_model(
     precision: Precision = "float32",
     sigma_scale: np.ndarray | None = None,
     scale_sigma: float = 0.0,
+    correlation: np.ndarray | None = None,
     camera_height_m: float | None = None,
 ) -> Predictor:
     """Return a predictor of a model in memory; the arguments are those of `load` and `Predictor`."""
@@ -208,6 +212,7 @@ def from_model(
         precision=precision,
         sigma_scale=sigma_scale,
         scale_sigma=scale_sigma,
+        correlation=correlation,
         camera_height_m=camera_height_m,
     )
 
@@ -298,6 +303,7 @@ def predict(
         flags=["held" if flag else "" for flag in held],
         estimate=estimate,
         scale_sigma=scale_sigma,
+        correlation=predictor.correlation,
     )
     about = {
         **result.about,

@@ -1,11 +1,11 @@
-"""How wrong a model was on validation drives: factors for its sigmas, and the error of its scale.
+"""How wrong a model was on validation drives: factors for its sigmas, and what its steps are wrong by together.
 
 Kept with the checkpoint whose weights they were fitted for.
 """
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from mdnvo_jax.odometry import COMPONENTS
 
 # In the folder of a step, so that it is copied and deleted with the weights and never meets others.
 FILE = "sigma_scale.json"
-# Raised when what is stored, or its meaning, changes. Version 1 has no error of scale.
+# Raised when what is stored, or its meaning, changes. Version 1 has factors alone.
 VERSION = 2
 _READABLE = (1, VERSION)
 
@@ -33,7 +33,8 @@ class SigmaScale:
       nll_after: the same with the factors applied.
       fitted_on: which data, in words and names.
       scale_sigma: relative standard deviation of the error of scale that a drive's steps share; 0 where none was found.
-      drives: how many it was fitted on.
+      correlation: of the errors of any two steps of a drive, without that of the scale, by component, `[6]`.
+      drives: how many these two were fitted on.
     """
 
     scale: np.ndarray
@@ -42,6 +43,7 @@ class SigmaScale:
     nll_after: float
     fitted_on: Mapping[str, Any]
     scale_sigma: float = 0.0
+    correlation: np.ndarray = field(default_factory=lambda: np.zeros(len(COMPONENTS)))
     drives: int = 0
 
 
@@ -60,7 +62,7 @@ def read(step_folder: str | Path) -> SigmaScale | None:
         if stored["version"] not in _READABLE:
             raise InputError(f"{path} has version {stored['version']}, expected {VERSION}: {mend}")
         if stored["version"] == 1:
-            stored |= {"scale_sigma": 0.0, "drives": 0}
+            stored |= {"scale_sigma": 0.0, "correlation": [0.0] * len(COMPONENTS), "drives": 0}
         scale = np.array(stored["scale"], np.float64)
         found = SigmaScale(
             scale=scale,
@@ -69,6 +71,7 @@ def read(step_folder: str | Path) -> SigmaScale | None:
             nll_after=float(stored["nll_after"]),
             fitted_on=dict(stored["fitted_on"]),
             scale_sigma=float(stored["scale_sigma"]),
+            correlation=np.array(stored["correlation"], np.float64),
             drives=int(stored["drives"]),
         )
     except InputError:
@@ -79,6 +82,8 @@ def read(step_folder: str | Path) -> SigmaScale | None:
         raise InputError(f"{path}: scale {scale.tolist()}: expected six factors above 0: {mend}")
     if not (np.isfinite(found.scale_sigma) and found.scale_sigma >= 0):
         raise InputError(f"{path}: scale_sigma {found.scale_sigma}: expected 0 or more: {mend}")
+    if found.correlation.shape != scale.shape or not ((found.correlation >= 0) & (found.correlation <= 1)).all():
+        raise InputError(f"{path}: correlation {found.correlation.tolist()}: expected six numbers from 0 to 1: {mend}")
     return found
 
 
@@ -93,6 +98,7 @@ def write(step_folder: str | Path, found: SigmaScale, **about: Any) -> Path:
         "nll_before": found.nll_before,
         "nll_after": found.nll_after,
         "scale_sigma": found.scale_sigma,
+        "correlation": found.correlation.tolist(),
         "drives": found.drives,
         "fitted_on": dict(found.fitted_on),
         **about,

@@ -20,7 +20,9 @@ SCALE = np.linspace(0.5, 2, 6)
 
 @pytest.fixture(scope="module")
 def model() -> predictor.Predictor:
-    return predictor.from_model(trained(), CONFIG, source="memory", sigma_scale=SCALE, scale_sigma=0.06)
+    return predictor.from_model(
+        trained(), CONFIG, source="memory", sigma_scale=SCALE, scale_sigma=0.06, correlation=SCALE / 10
+    )
 
 
 @pytest.fixture(scope="module")
@@ -98,6 +100,7 @@ def test_about_says_what_a_reader_has_to_know(folder: Path) -> None:
     assert about["state"]["gates"]["shape"] == [4, 64]
     assert about["sigma_scale"] == SCALE.tolist()
     assert about["scale_sigma"] == 0.06
+    assert about["step_correlation"] == pytest.approx(SCALE / 10)
     with np.load(folder / "start.npz") as start:
         assert {name: list(value.shape) for name, value in start.items()} == {
             name: leaf["shape"] for name, leaf in about["state"].items()

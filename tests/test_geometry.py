@@ -421,6 +421,35 @@ def test_an_error_of_scale_lengthens_the_way_from_the_first_pose(lib: SimpleName
     np.testing.assert_array_equal(lib.scale_covariance(poses, 0.0), np.zeros((8, 6, 6)))
 
 
+def test_errors_that_steps_share_by_their_definition(lib: SimpleNamespace) -> None:
+    rng = np.random.default_rng(8)
+    T_steps = geo.step_to_matrix(steps(6, seed=9, size=0.5))
+    directions = rng.normal(size=(6, 6, 3))
+    first = geo.step_to_matrix(steps(1, seed=10)[0])
+    poses = geo.accumulate(T_steps, first)
+
+    def moved(e: np.ndarray) -> np.ndarray:
+        # Every step by the same e, each in its own direction.
+        return geo.accumulate(T_steps @ geo.exp_se3(directions @ e), first)
+
+    for pose in range(7):
+        T_inverse = geo.inverse(poses[pose])
+        jacobian = numerical_jacobian(lambda e, T=T_inverse, j=pose: geo.log_se3(T @ moved(e)[j]), np.zeros(3))
+        np.testing.assert_allclose(
+            lib.shared_covariance(poses, directions)[pose], jacobian @ jacobian.T, rtol=1e-6, atol=1e-6
+        )
+    # Batches of paths.
+    both = lib.shared_covariance(np.stack([poses, poses]), np.stack([directions, 2 * directions]))
+    np.testing.assert_allclose(both[1], 4 * both[0], rtol=1e-12, atol=1e-12)
+
+
+def test_an_error_of_scale_is_one_that_steps_share(lib: SimpleNamespace) -> None:
+    vectors = steps(8, seed=11)
+    poses = geo.accumulate(geo.step_to_matrix(vectors))
+    shift = geo.step_jacobian(vectors)[..., :3] @ vectors[:, :3, None]
+    np.testing.assert_allclose(lib.shared_covariance(poses, 0.1 * shift), lib.scale_covariance(poses, 0.1), atol=1e-12)
+
+
 def test_independent_errors_and_one_of_scale_add_up(lib: SimpleNamespace) -> None:
     """As a filter has it that carries the error of the scale along as a seventh state."""
     rng = np.random.default_rng(3)

@@ -13,6 +13,8 @@ from mdnvo_jax import geometry, odometry
 from mdnvo_jax.errors import InputError
 from mdnvo_jax.mixture import Mixture
 
+RHO = np.array([0.6, 0.2, 0.0, 0.5, 0.4, 0.1])
+
 
 def densities(count: int, components: int = 2, seed: int = 0) -> Mixture:
     generator = np.random.default_rng(seed)
@@ -98,8 +100,8 @@ def test_an_error_of_scale_grows_with_the_distance_where_those_of_steps_average_
     assert (alone.scale_sigma, path.scale_sigma) == (0, 0.05)
 
 
-def test_without_an_error_of_scale_nothing_changes() -> None:
-    path = odometry.trajectory(densities(30), coupling="joint", scale_sigma=0.0)
+def test_without_errors_that_steps_share_nothing_changes() -> None:
+    path = odometry.trajectory(densities(30), coupling="joint", scale_sigma=0.0, correlation=np.zeros(6))
     perturbation = geometry.step_covariance_to_perturbation(path.steps, path.step_covariance)
     expected = geometry.propagate_covariance(geometry.step_to_matrix(path.steps), perturbation)
     assert path.covariance.tobytes() == np.asarray(expected).tobytes()
@@ -126,6 +128,57 @@ def test_a_monte_carlo_over_steps_and_scale_has_the_covariance_that_is_told() ->
     assert np.trace(np.linalg.solve(expected, np.cov(errors.T))) / 6 == pytest.approx(1, abs=0.1)
 
 
+@pytest.mark.parametrize("rho", [0.0, 0.3, 1.0])
+def test_correlated_errors_of_steps_add_up_where_independent_ones_average_out(rho: float) -> None:
+    sigma = np.array([0.01, 0.02, 0.1, 1e-9, 1e-9, 1e-9])
+    straight = gaussian_steps(np.tile([0, 0, 2.0, 0, 0, 0], (100, 1)), sigma)
+    path = odometry.trajectory(straight, coupling="joint", correlation=np.array([rho, 0, rho, 0, 0, 0]))
+    count = np.arange(101)
+    # Of n errors of variance 1, any two of which have the correlation rho: n + n (n - 1) rho.
+    grown = np.sqrt(count + count * (count - 1) * rho)
+    found = np.sqrt(np.diagonal(path.covariance, axis1=1, axis2=2))
+    expected = np.stack([sigma[0] * grown, sigma[1] * np.sqrt(count), sigma[2] * grown], axis=1)
+    np.testing.assert_allclose(found[:, :3], expected, rtol=1e-6)
+    # A single step is as unsure as it says.
+    np.testing.assert_allclose(path.sigma, np.tile(sigma, (100, 1)), rtol=1e-6)
+    np.testing.assert_allclose(found[1, :3], sigma[:3], rtol=1e-6)
+
+
+def test_a_monte_carlo_over_correlated_steps_has_the_covariance_that_is_told() -> None:
+    generator = np.random.default_rng(3)
+    count, draws = 25, 4000
+    scale = np.array([0.01, 0.01, 0.03, 0.001, 0.004, 0.001])
+    mean = np.tile([0.02, 0, 1, 0, 0.05, 0], (count, 1)).astype(float)
+    path = odometry.trajectory(gaussian_steps(mean, scale), coupling="joint", correlation=RHO)
+    samples = np.tile(np.eye(4), (draws, 1, 1))
+    shared = generator.normal(size=(draws, 6))
+    for index in range(count):
+        error = np.sqrt(RHO) * shared + np.sqrt(1 - RHO) * generator.normal(size=(draws, 6))
+        samples = samples @ geometry.step_to_matrix(mean[index] + scale * error)
+    errors = geometry.log_se3(geometry.inverse(path.poses[-1]) @ samples)
+    np.testing.assert_allclose(np.cov(errors.T), path.covariance[-1], atol=0.05 * np.abs(path.covariance[-1]).max())
+    assert np.trace(np.linalg.solve(path.covariance[-1], np.cov(errors.T))) / 6 == pytest.approx(1, abs=0.1)
+
+
+def test_the_correlation_of_steps_does_not_matter_after_the_first() -> None:
+    # A large turn, so that the axes of the two frames differ.
+    turn = gaussian_steps(np.array([[0.3, -0.1, 1, 0.4, 1.2, -0.3]]), np.array([0.01, 0.02, 0.1, 0.01, 0.03, 0.05]))
+    alone, together = (odometry.trajectory(turn, coupling="joint", correlation=rho) for rho in (None, RHO))
+    np.testing.assert_allclose(together.covariance, alone.covariance, atol=1e-15)
+
+
+def test_correlated_components_of_a_step_stay_a_covariance() -> None:
+    """A joint density couples components; taking a share of some variances must leave a covariance."""
+    path = odometry.trajectory(densities(20), coupling="joint", correlation=np.array([1, 0, 0.5, 0.9, 0, 0.99]))
+    assert np.all(np.linalg.eigvalsh(path.covariance[1:]) > 0)
+
+
+@pytest.mark.parametrize("correlation", [np.full(6, 1.1), np.full(6, -0.1), np.full(6, np.nan), np.zeros(3)])
+def test_correlations_that_are_none_are_named(correlation: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="six numbers from 0 to 1"):
+        odometry.trajectory(densities(3), coupling="joint", correlation=correlation)
+
+
 @pytest.mark.parametrize("sigma", [-0.01, float("nan"), float("inf")])
 def test_a_scale_error_that_is_none_is_named(sigma: float) -> None:
     with pytest.raises(InputError, match="expected a share"):
@@ -139,6 +192,7 @@ def test_the_files_hold_the_trajectory(tmp_path: Path) -> None:
         timestamps=100 + 0.1 * np.arange(13),
         flags=["held"] + [""] * 11,
         scale_sigma=0.05,
+        correlation=np.array([0, 0, 0, 0, 0.25, 0]),
     )
     path.save(tmp_path / "out")
     names = {entry.name for entry in (tmp_path / "out").iterdir()}
@@ -179,6 +233,7 @@ def test_the_files_hold_the_trajectory(tmp_path: Path) -> None:
     assert summary["flagged_steps"] == 1
     assert summary["coupling"] == "joint"
     assert summary["scale_sigma"] == 0.05
+    assert summary["step_correlation"]["ry"] == 0.25
 
 
 def test_results_are_not_overwritten_by_accident(tmp_path: Path) -> None:

@@ -51,6 +51,7 @@ def parser() -> Parser:
     add("--camera-height", type=float, metavar="METRES", help="of its camera above the road [that of the training]")
     add("--mode", choices=("offline", "streaming"), default="offline", help="streaming: past alone [%(default)s]")
     add("--estimate", choices=("mean", "strongest"), default="mean", help="what a mixture is reported by [%(default)s]")
+    add("--scale-sigma", type=float, metavar="SHARE", help="1-sigma error of each path's scale [fitted, or 0]")
     add("--no-recalibration", action="store_true", help="sigmas as the network gave them")
     _add_common(model)
     _add_recalibrate(subcommands)
@@ -60,7 +61,7 @@ def parser() -> Parser:
 
 def _add_recalibrate(subcommands: "argparse._SubParsersAction[Parser]") -> None:
     """Add the subcommand that fits a sigma scale."""
-    fit_help = "fit a factor for each sigma, and the error of scale, on the training's validation split, for predict"
+    fit_help = "fit sigmas, and errors that steps share, on the training's own validation split, for predict to apply"
     add = subcommands.add_parser("recalibrate", help=fit_help, description=fit_help).add_argument
     add("--checkpoint", required=True, metavar="DIR", help="the --workdir of a training; the factors are kept in it")
     add("--root", metavar="DIR", help="the folder of the training's data set [where the training found it]")

@@ -59,11 +59,15 @@ def from_options(options: argparse.Namespace) -> Report:
         if sequence.poses is None or sequence.count < 2:
             raise InputError(f"sequence {sequence.name} has no poses of two frames: there is nothing to judge against")
         bar = functools.partial(track, name=sequence.name)
-        path = predictor.predict(model, sequence, mode=options.mode, estimate=options.estimate, progress=bar)
+        path = predictor.predict(
+            model, sequence, mode=options.mode, estimate=options.estimate, scale_sigma=options.scale_sigma, progress=bar
+        )
         predicted.append(Predicted(sequence.name, path, sequence.poses))
     labels = model.model.labels
     step = MeanStep(np.asarray(labels.mean, float), np.asarray(labels.std, float), "mean step of the training split")
     how = f"{options.mode}, {options.estimate}{'' if model.sigma_scale is None else ', sigma recalibrated'}"
+    if scale_sigma := predicted[0].trajectory.scale_sigma:
+        how += f", scale known to {100 * scale_sigma:.1f} %"
     return evaluate(f"model ({how})", predicted, step, block=options.block)
 
 

@@ -1,4 +1,4 @@
-"""Sigmas and the error of scale fitted on the validation split of a training alone: what `evaluate recalibrate` does.
+"""Sigmas, and errors that steps share, fitted on the validation split of a training: what `evaluate recalibrate` does.
 
 No sequence can be named: the split is that of the checkpoint's own configuration, so that no test data gets in.
 """
@@ -10,7 +10,7 @@ import shlex
 import sys
 from collections.abc import Sequence as Many
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -19,7 +19,7 @@ from mdnvo_jax.errors import InputError
 from mdnvo_jax.evaluation.calibration import SIGMA_LEVELS, StepScores, fit_sigma_scale, is_inside, score
 from mdnvo_jax.evaluation.calibration_tables import NOMINAL
 from mdnvo_jax.evaluation.model import track
-from mdnvo_jax.evaluation.scale_error import fit_scale_sigma, scale_error
+from mdnvo_jax.evaluation.shared_errors import fit_correlation, fit_scale_sigma, scale_error
 from mdnvo_jax.evaluation.tables import Column, Row, Table, Value
 from mdnvo_jax.mixture import Coupling, Mixture, widen
 from mdnvo_jax.odometry import COMPONENTS
@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 # Fewer steps determine a factor to no better than 7 %: that of a Gaussian is known to 1 / sqrt(2 n).
 _FEW_STEPS = 100
-# Fewer drives determine the error of scale to no better than 16 %, for the same reason.
+# Fewer drives determine what steps are wrong by together to no better than 16 %, for the same reason.
 _FEW_DRIVES = 20
 
 
@@ -89,10 +89,11 @@ def validation_sequences(config: "Config", *, root: str | None, cache: str | Non
 def fit(
     predictions: Many[tuple[Mixture, np.ndarray]], coupling: Coupling, fitted_on: dict[str, Any]
 ) -> tuple[SigmaScale, Table]:
-    """Fit factors and the error of scale on several sequences, and tabulate what the factors do to them.
+    """Fit factors and errors that steps share on several sequences, and tabulate what the factors do to them.
 
     The factors are those of `calibration.fit_sigma_scale`, over all steps. What the steps of a drive are wrong by
-    together is then judged by the sigmas that they have with the factors; see `scale_error`.
+    together is then judged by the sigmas that they have with the factors, first as an error of scale, and as
+    correlated errors what is left; see `shared_errors`.
 
     Args:
       predictions: of each sequence, densities `[n, M, 6]` and true steps `[n, 6]`.
@@ -110,35 +111,54 @@ def fit(
     scale = fit_sigma_scale(density, truth)
     before = score(density, truth, coupling=coupling)
     after = score(widen(density, scale), truth, coupling=coupling)
-    errors, variances = _scale_errors(predictions, coupling, scale)
+    together = _errors_together(predictions, coupling, scale)
     found = SigmaScale(
         scale=scale,
         steps=len(truth),
         nll_before=float(before.nll.mean()),
         nll_after=float(after.nll.mean()),
-        fitted_on=fitted_on | {"scale_errors": errors.tolist()},
-        scale_sigma=fit_scale_sigma(errors, variances),
-        drives=int(np.isfinite(variances).sum()),
+        fitted_on=fitted_on | {"scale_errors": together.scale.tolist()},
+        scale_sigma=fit_scale_sigma(together.scale, together.variance),
+        correlation=fit_correlation(together.rest, together.steps),
+        drives=len(predictions),
     )
     return found, _table(found, before, after)
 
 
-def _scale_errors(
-    predictions: Many[tuple[Mixture, np.ndarray]], coupling: Coupling, scale: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the error of scale of each sequence and its variance, with sigmas that `scale` is applied to."""
-    pairs = []
-    for density, steps in predictions:
+class _Together(NamedTuple):
+    """What the steps of each of D drives are wrong by together.
+
+    Attributes:
+      scale: error of scale, `[D]`.
+      variance: of that, `[D]`.
+      rest: mean of the standardised errors that are left without it, `[D, 6]`.
+      steps: in each drive, `[D]`.
+    """
+
+    scale: np.ndarray
+    variance: np.ndarray
+    rest: np.ndarray
+    steps: np.ndarray
+
+
+def _errors_together(predictions: Many[tuple[Mixture, np.ndarray]], coupling: Coupling, scale: np.ndarray) -> _Together:
+    """Measure sequences, with sigmas that `scale` is applied to."""
+    rows = []
+    for density, truth in predictions:
         widened = widen(density, scale)
-        mean, covariance = mixture.mean(widened), mixture.covariance(widened, coupling=coupling)
-        pairs.append(scale_error(np.asarray(mean, np.float64), np.asarray(covariance, np.float64), steps))
-    errors, variances = np.array(pairs).T
-    return errors, variances
+        mean = np.asarray(mixture.mean(widened), np.float64)
+        covariance = np.asarray(mixture.covariance(widened, coupling=coupling), np.float64)
+        error, variance = scale_error(mean, covariance, truth)
+        without = np.concatenate([(1 + error) * mean[:, :3], mean[:, 3:]], axis=1)
+        standardised = (truth - without) / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
+        rows.append((error, variance, standardised.mean(axis=0), len(truth)))
+    return _Together(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
 def _table(found: SigmaScale, before: StepScores, after: StepScores) -> Table:
     """Return a row a component: its factor, and the share of truths inside intervals before and after."""
     columns = [Column("component", "component"), Column("factor", "sigma times", 3)]
+    columns.append(Column("correlation", "correlation between steps", 3))
     for level, nominal in enumerate(NOMINAL):
         columns += [
             Column(f"{when}_{level}", f"in {level + 1} sigma, {when} ({nominal:.2f} %)", 1)
@@ -153,6 +173,7 @@ def _table(found: SigmaScale, before: StepScores, after: StepScores) -> Table:
         {
             "component": name,
             "factor": Value(float(found.scale[k])),
+            "correlation": Value(float(found.correlation[k])),
             **{key: Value(float(values[k])) for key, values in shares.items()},
         }
         for k, name in enumerate(COMPONENTS)
@@ -165,7 +186,8 @@ def _table(found: SigmaScale, before: StepScores, after: StepScores) -> Table:
         f"likelihood over {found.drives} drives"
     )
     if 0 < found.drives < _FEW_DRIVES:
-        notes.append(f"{found.drives} drives are few: it is known to some {100 / np.sqrt(2 * found.drives):.0f} %")
+        share = 100 / np.sqrt(2 * found.drives)
+        notes.append(f"{found.drives} drives are few: it is known to some {share:.0f} %, and so are the correlations")
     names = ", ".join(found.fitted_on["sequences"])
     title = f"Sigma scale, fitted on {found.steps} steps of the training's validation split ({names})"
     return Table(title, columns, rows, notes=notes)

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 
 from mdnvo_jax import evaluate as command
-from mdnvo_jax import geometry, predictor, recalibration
+from mdnvo_jax import geometry, odometry, predictor, recalibration
 from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig
 from mdnvo_jax.errors import InputError, exit_code
 from mdnvo_jax.evaluation import recalibrate
-from mdnvo_jax.mixture import Mixture
+from mdnvo_jax.mixture import Mixture, widen
 from mdnvo_jax.model.head import Labels
 from mdnvo_jax.model.network import build
 from mdnvo_jax.recalibration import SigmaScale
@@ -28,6 +28,7 @@ CONFIG = Config(
 )
 LABELS = Labels(np.array([0, 0, 1, 0, 0.01, 0]), np.array([0.02, 0.02, 0.5, 0.005, 0.02, 0.005]))
 SCALE = np.array([0.5, 1, 2, 3, 4, 5])
+RHO = np.array([0.9, 0.6, 0.1, 0.2, 0.3, 0.2])
 
 
 @pytest.fixture(scope="module")
@@ -70,7 +71,7 @@ def run(*arguments):
 
 def some_scale():
     about = {"split": "validation split of the training", "sequences": ["00"]}
-    return SigmaScale(SCALE, 10, 1.0, 0.5, about, scale_sigma=0.06, drives=3)
+    return SigmaScale(SCALE, 10, 1.0, 0.5, about, scale_sigma=0.06, correlation=RHO, drives=3)
 
 
 def test_a_mixture_too_sure_by_two_is_widened_by_two():
@@ -123,6 +124,37 @@ def test_the_error_of_scale_that_drives_share_is_found():
     assert "40 drives are few" not in " ".join(table.notes)
     few = recalibrate.fit(parts[:3], "joint", {"sequences": ["a", "b", "c"]})[1]
     assert "3 drives are few: it is known to some 41 %" in " ".join(few.notes)
+
+
+def test_the_correlation_of_steps_is_found_beside_the_error_of_scale():
+    rng = np.random.default_rng(6)
+    sigma, rho = np.array([0.02, 0.02, 0.1, 0.001, 0.001, 0.001]), np.array([0.8, 0.3, 0.0, 0.0, 0.5, 0.1])
+    parts = []
+    for _ in range(80):
+        mean = np.tile([0, 0, 1.5, 0, 0.01, 0.0], (100, 1))
+        error = np.sqrt(rho) * rng.standard_normal(6) + np.sqrt(1 - rho) * rng.standard_normal((100, 6))
+        truth = mean + sigma * error
+        truth[:, 2] += 0.06 * rng.standard_normal() * 1.5
+        parts.append((Mixture(np.zeros((100, 1)), mean[:, None], np.tile(np.log(sigma), (100, 1, 1))), truth))
+    names = {"sequences": [str(number) for number in range(80)]}
+    found, table = recalibrate.fit(parts, "joint", names)
+    np.testing.assert_allclose(np.delete(found.correlation, 2), np.delete(rho, 2), atol=0.12)
+    # What lasts in the direction of motion is called scale, and once.
+    assert found.correlation[2] < 0.01
+    assert found.scale_sigma == pytest.approx(0.06, rel=0.25)
+    assert table.rows[0]["correlation"].value == found.correlation[0]
+    # The covariance of the end then holds what the drives were off by.
+    nees = {"independent": [], "together": []}
+    for density, truth in parts:
+        for name, more in (
+            ("independent", {}), ("together", {"scale_sigma": found.scale_sigma, "correlation": found.correlation})
+        ):  # fmt: skip
+            path = odometry.trajectory(widen(density, found.scale), coupling="joint", **more)
+            end = geometry.accumulate(geometry.step_to_matrix(truth))[-1]
+            error = geometry.log_se3(geometry.inverse(path.poses[-1]) @ end)
+            nees[name].append(error @ np.linalg.solve(path.covariance[-1], error))
+    assert np.mean(nees["independent"]) > 50
+    assert np.mean(nees["together"]) == pytest.approx(6, rel=0.3)
 
 
 def test_the_command_fits_on_the_validation_split_alone(workdir, root, tmp_path, capsys):
@@ -188,11 +220,14 @@ def test_every_sigma_is_multiplied_and_nothing_else(workdir, root, mode):
     own = predictor.predict(predictor.load(workdir), frames, mode=mode, scale_sigma=0.0)
     added = after.covariance - own.covariance
     np.testing.assert_allclose(added, geometry.scale_covariance(after.poses, 0.06), atol=1e-9)
+    again = odometry.trajectory(after.mixture, coupling=after.coupling, scale_sigma=0.06, correlation=RHO)
+    np.testing.assert_allclose(after.covariance, again.covariance, rtol=1e-9)
+    np.testing.assert_array_equal((before.correlation, after.correlation), (np.zeros(6), RHO))
     # The density has the same shape: its components are as many sigmas from the mean as they were.
     offsets = [(path.mixture.mean - path.steps[:, None]) / path.sigma[:, None] for path in (before, after)]
     np.testing.assert_allclose(offsets[1], offsets[0], atol=1e-4)
     without = predictor.load(workdir, recalibrated=False)
-    assert without.sigma_scale is None and without.scale_sigma == 0
+    assert without.sigma_scale is None and without.correlation is None and without.scale_sigma == 0
 
 
 def test_an_impossible_error_of_scale_is_refused_before_the_work(workdir, root):
@@ -241,6 +276,8 @@ def test_the_training_goes_on_beside_the_file(workdir):
         ({"scale_sigma": -0.1}, "expected 0 or more"),
         ({"scale_sigma": float("nan")}, "expected 0 or more"),
         ({"scale_sigma": None}, "damaged"),
+        ({"correlation": [0, 0, 0, 0, 0, 1.5]}, "six numbers from 0 to 1"),
+        ({"correlation": [0, 0]}, "six numbers from 0 to 1"),
     ],
 )
 def test_a_damaged_file_is_named(tmp_path, change, message):
@@ -252,15 +289,15 @@ def test_a_damaged_file_is_named(tmp_path, change, message):
         recalibration.read(tmp_path)
 
 
-def test_a_file_of_the_first_version_has_no_error_of_scale(tmp_path):
+def test_a_file_of_the_first_version_has_factors_alone(tmp_path):
     path = recalibration.write(tmp_path, some_scale())
     assert (recalibration.read(tmp_path).scale_sigma, recalibration.read(tmp_path).drives) == (0.06, 3)
     stored = json.loads(path.read_text())
-    path.write_text(
-        json.dumps({k: v for k, v in stored.items() if k not in ("scale_sigma", "drives")} | {"version": 1})
-    )
+    later = ("scale_sigma", "correlation", "drives")
+    path.write_text(json.dumps({name: stored[name] for name in stored if name not in later} | {"version": 1}))
     found = recalibration.read(tmp_path)
     assert (found.scale_sigma, found.drives, found.scale.tolist()) == (0, 0, SCALE.tolist())
+    np.testing.assert_array_equal(found.correlation, np.zeros(6))
 
 
 def test_no_step_no_fit():

@@ -26,7 +26,7 @@ RENDERED = dataclasses.replace(
     CONFIG,
     data=dataclasses.replace(CONFIG.data, dataset="synthetic", root="/home/somebody", cache="/home/somebody/cache"),
 )
-FITTED = SigmaScale(np.linspace(0.5, 2, 6), 100, 1.0, 0.5, {"sequences": ["world_1000000"]}, 0.06, 8)
+FITTED = SigmaScale(np.linspace(0.5, 2, 6), 100, 1.0, 0.5, {"sequences": ["world_1000000"]}, 0.06, np.full(6, 0.2), 8)
 
 
 def recalibrated(folder: Path, config: Config = RENDERED) -> Path:
@@ -60,7 +60,7 @@ def test_what_ships_predicts_as_the_training_does(workdir: Path, installed: Path
     mine, theirs = (predictor.predict(predictor.load(path), FRAMES[:8]) for path in (None, workdir))
     np.testing.assert_array_equal(mine.mixture.mean, theirs.mixture.mean)
     np.testing.assert_array_equal(mine.covariance, theirs.covariance)
-    assert mine.scale_sigma == 0.06
+    assert mine.scale_sigma == 0.06 and mine.correlation.tolist() == [0.2] * 6
     assert mine.about["checkpoint"] == str(installed)
     assert weights.config().image == CONFIG.image
 

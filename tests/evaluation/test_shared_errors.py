@@ -1,10 +1,10 @@
-"""The error of scale of a drive against least squares by hand, and its spread over drives against what was drawn."""
+"""Errors that steps share against least squares by hand, and their spread over drives against what was drawn."""
 
 import numpy as np
 import pytest
 from scipy import optimize, stats
 
-from mdnvo_jax.evaluation.scale_error import fit_scale_sigma, scale_error
+from mdnvo_jax.evaluation.shared_errors import fit_correlation, fit_scale_sigma, scale_error
 
 RNG = np.random.default_rng(0)
 
@@ -88,3 +88,24 @@ def test_it_finds_what_was_drawn_from_drives_of_all_lengths():
     variances = np.exp(RNG.uniform(np.log(1e-5), np.log(1e-1), 4000))
     errors = RNG.normal(0, np.sqrt(0.07**2 + variances))
     assert fit_scale_sigma(errors, variances) == pytest.approx(0.07, rel=0.05)
+
+
+def test_the_correlation_of_long_drives_is_the_mean_square_of_their_means():
+    means = RNG.normal(0, [0.9, 0.5, 0.1], (500, 3))
+    found = fit_correlation(means, np.full(500, 10**9))
+    np.testing.assert_allclose(found, (means**2).mean(axis=0), atol=6e-4)
+
+
+def test_the_correlation_is_found_from_drives_of_all_lengths():
+    rho = np.array([0.0, 0.05, 0.3, 0.8])
+    counts = RNG.integers(2, 300, 3000)
+    means = np.array([np.sqrt(rho) * RNG.normal(size=4) + np.sqrt((1 - rho) / n) * RNG.normal(size=4) for n in counts])
+    assert np.all(np.abs(fit_correlation(means, counts) - rho) < 0.1 * rho + 0.003)
+
+
+def test_means_of_independent_errors_have_no_correlation():
+    counts = np.full(8, 50)
+    assert (fit_correlation(np.full((8, 2), 0.9 / np.sqrt(50)), counts) == 0).all()
+    # Never so much that a step has nothing of its own, and drives of one step tell nothing.
+    assert fit_correlation(np.full((8, 1), 5.0), counts)[0] == pytest.approx(0.999)
+    assert fit_correlation(RNG.normal(size=(8, 1)), np.ones(8))[0] == 0
