@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 _FEW_STEPS = 100
 # Fewer drives determine what steps are wrong by together to no better than 16 %, for the same reason.
 _FEW_DRIVES = 20
+# Drives that the table's title names.
+_NAMED = 8
 
 
 def run(options: argparse.Namespace) -> tuple[Table, Path]:
@@ -188,7 +190,8 @@ def _table(found: SigmaScale, before: StepScores, after: StepScores) -> Table:
     if 0 < found.drives < _FEW_DRIVES:
         share = 100 / np.sqrt(2 * found.drives)
         notes.append(f"{found.drives} drives are few: it is known to some {share:.0f} %, and so are the correlations")
-    names = ", ".join(found.fitted_on["sequences"])
+    sequences = found.fitted_on["sequences"]
+    names = ", ".join(sequences) if len(sequences) <= _NAMED else f"{len(sequences)} drives"
     title = f"Sigma scale, fitted on {found.steps} steps of the training's validation split ({names})"
     return Table(title, columns, rows, notes=notes)
 
