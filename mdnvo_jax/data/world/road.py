@@ -122,16 +122,19 @@ def _events(style: Style, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
     takes a share of what speed, lateral acceleration and yaw rate allow at its place.
     """
     # Distance between two places where the driver may slow down and the road may bend: 4 to 6 s apart.
-    pitch = 30 + 2.8 * style.cruise_mps
+    pitch = 25.0 if style.winding else 30 + 2.8 * style.cruise_mps
     count = int((s[-1] - s[0]) // pitch)
     draw = stream(style.seed, "events").random((count, 8))
     place = s[0] + pitch * (np.arange(count) + 0.5 + 0.4 * (draw[:, 0] - 0.5))
     place = s[0] + NODE_M * np.rint((place - s[0]) / NODE_M)
-    slow = draw[:, 1] < style.stops + style.slows
+    slow = (draw[:, 1] < style.stops + style.slows) | style.winding
     # Nobody stops for the first metres: a still start is the business of worlds that stand.
     stop = (draw[:, 1] < style.stops) & (np.abs(place) > 15)
     factor = np.where(slow, 0.15 + 0.4 * draw[:, 2], 0.88 + 0.24 * draw[:, 2])
     target = np.where(stop, 0.0, np.minimum(style.cruise_mps * factor, TOP_SPEED_MPS))
+    if style.winding:
+        # Where lateral acceleration and yaw rate both are near what a car does.
+        target = np.where(stop, 0.0, np.minimum(style.cruise_mps, 3.5 + 4 * draw[:, 2]))
     hold = np.where(stop, 0.0, np.where(slow, 8.0, 0.3 * pitch))
     away = np.abs(s[:, None] - place)
     squared = (target**2 + 2 * style.acceleration_mps2 * np.maximum(away - hold, 0)).min(1)
@@ -143,9 +146,13 @@ def _events(style: Style, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
     limit = _curvature_limit(speed)
     here = limit[np.rint((place - s[0]) / NODE_M).astype(int)]
     # Corners are cut where the car slows for them; elsewhere small bends are common and strong ones rare.
-    share = np.where(slow & ~stop, 0.4 + 0.6 * draw[:, 3], style.bends * draw[:, 3])
+    least = 0.75 if style.winding else 0.4
+    share = np.where(slow & ~stop, least + (1 - least) * draw[:, 3], style.bends * draw[:, 3])
     bend = np.where(draw[:, 4] < 0.5, -1, 1) * share * here * (draw[:, 5] < 0.8)
     turn = np.deg2rad(10 + 90 * draw[:, 6])
+    if style.winding:
+        # The ramps at both ends of a corner take as much of its angle again.
+        turn = 1.6 * np.deg2rad(60 + 50 * draw[:, 6])
     extent = np.clip(turn / np.maximum(np.abs(bend), 1e-6), 12.0, 0.9 * pitch)
     ramp = np.clip((0.5 - away / extent) / 0.3, 0, 1)
     curvature = (bend * ramp * ramp * (3 - 2 * ramp)).sum(1)

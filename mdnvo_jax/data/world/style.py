@@ -16,6 +16,7 @@ class Style(NamedTuple):
       acceleration_mps2: of speeding up and braking.
       stops, slows: chances that a place on the road makes the car stop, or slow down.
       bends: strength of ordinary bends, as a share of what the speed allows.
+      winding: whether corner follows corner, as sharp as the car can take them: turns at junctions, narrow streets.
       side_roads: chance of a side road every 90 m.
       steepness: largest slope of the ground, m/m.
       side: 1 for traffic on the right, -1 on the left.
@@ -45,6 +46,7 @@ class Style(NamedTuple):
     stops: float
     slows: float
     bends: float
+    winding: bool
     side_roads: float
     steepness: float
     side: int
@@ -128,6 +130,7 @@ def draw_style(seed: int) -> Style:
         stops=0.15 * town * rng.random(),
         slows=0.8 * (1 - motorway) * rng.random(),
         bends=rng.random(),
+        winding=bool(3 < cruise < 15 and stream(seed, "winding").random() < 0.5),
         side_roads=0.6 * town + 0.1 * (not motorway),
         steepness=abs(rng.normal(0, 0.03)) if town > 0.5 else abs(rng.normal(0, 0.045)),
         side=1 if rng.random() < 0.75 else -1,
