@@ -5,7 +5,7 @@ import pytest
 
 from mdnvo_jax.config import Config, DataConfig, ImageConfig
 from mdnvo_jax.data import cache, load, synthetic
-from mdnvo_jax.data.world.motion import draw_mount
+from mdnvo_jax.data.world.motion import CAMERA_HEIGHT_M, draw_mount
 from mdnvo_jax.errors import InputError
 
 IMAGE = ImageConfig(height=20, width=62, channels=3)
@@ -78,7 +78,8 @@ def asked(toy, monkeypatch):
     """Stand in for the renderer; note what is asked of it."""
     notes = []
 
-    def drive(seed, frames, *, height, width, channels, camera):
+    def drive(seed, frames, *, height, width, channels, camera, camera_height_m, scaled_to_height_m):
+        assert camera_height_m == CAMERA_HEIGHT_M and scaled_to_height_m is None
         notes.append((seed, frames, height, width, channels, camera))
         return toy(frames, name=str(seed), camera=camera or (20.0, 20.0, 15.0, 8.0), size=(height, width))
 

@@ -65,7 +65,9 @@ def test_cameras_vary_and_their_poses_are_where_they_are():
 
 def test_a_bump_rings_in_the_labels(monkeypatch):
     """Poses move by the pitch and the heave of the body, no less and no more; a car that stands does not ring."""
-    seed = first_seed(lambda s: abs(motion._bumps(s, np.arange(0.0, 200), np.full(200, 10.0))[0]).max() > 0.005)
+    seed = first_seed(
+        lambda s: not s.winding and abs(motion._bumps(s, np.arange(0.0, 200), np.full(200, 10.0))[0]).max() > 0.005
+    )
     style, road, poses = world.path(seed, 100)
     s = road_coordinate(road, 0.1 * np.arange(100))
     pitch, heave = motion._bumps(style, s, np.gradient(s, 0.1))

@@ -71,7 +71,8 @@ def test_road_coordinates_undo_place(paths):
         eye = whole.poses[40, :3, 3]
         found_s, found_d, _ = undo(np.float32(x - eye[0]), np.float32(z - eye[2]), frame.lane)
         near = np.hypot(x - eye[0], z - eye[2]) < 90
-        np.testing.assert_allclose(found_s[near], s[near], atol=0.02)
+        # Where a corner begins, the curvature changes within a node's length.
+        np.testing.assert_allclose(found_s[near], s[near], atol=0.04)
         np.testing.assert_allclose(found_d[near], d[near], atol=0.02)
 
 

@@ -148,7 +148,11 @@ def _events(style: Style, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
     # Corners are cut where the car slows for them; elsewhere small bends are common and strong ones rare.
     least = 0.75 if style.winding else 0.4
     share = np.where(slow & ~stop, least + (1 - least) * draw[:, 3], style.bends * draw[:, 3])
-    bend = np.where(draw[:, 4] < 0.5, -1, 1) * share * here * (draw[:, 5] < 0.8)
+    side = np.where(draw[:, 4] < 0.5, -1, 1) * (draw[:, 5] < 0.8)
+    if style.winding:
+        # Left and right by turns: so many sharp corners to one side would lead the road across itself.
+        side = np.where((np.arange(count) + style.seed) % 2, -1, 1)
+    bend = side * share * here
     turn = np.deg2rad(10 + 90 * draw[:, 6])
     if style.winding:
         # The ramps at both ends of a corner take as much of its angle again.
