@@ -5,7 +5,8 @@
     python -m mdnvo_jax.evaluate recalibrate --checkpoint runs/pretrained
 
 Frames of any camera with known intrinsics are brought to one virtual camera: 82 degrees across, as KITTI's, without the
-upper third of the sky. BENCHMARKS.md has what each choice was measured to be worth.
+upper third of the sky. What each choice is worth has not been measured yet: `bin/ablate` does it on
+`configs/ablation.py`.
 """
 
 from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig, TrainingConfig
