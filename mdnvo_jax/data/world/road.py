@@ -115,54 +115,100 @@ def clearance_to_side_roads(road: Road, x: np.ndarray, z: np.ndarray, s: np.ndar
     return gap.min(1)
 
 
+class _Corners(NamedTuple):
+    """Places where the driver may slow down and the road may bend, each field `[n]`.
+
+    Attributes:
+      place: s, m. stop: whether the car stops there. pause: for how long, s.
+      target: speed where it does not stop, m/s, kept for `hold` metres before and after.
+      share: of the sharpest bend that may be driven there, positive to the right.
+      turn: angle of the bend, rad, over `longest` metres at most, which is a number.
+    """
+
+    place: np.ndarray
+    stop: np.ndarray
+    pause: np.ndarray
+    target: np.ndarray
+    hold: np.ndarray
+    share: np.ndarray
+    turn: np.ndarray
+    longest: float
+
+
 def _events(style: Style, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return (speed, pause, curvature) of the nodes at `s`, from places where the car slows and the road bends.
 
     The speed is the upper envelope that constant acceleration a allows: `v(s)^2 = min_j v_j^2 + 2 a |s - s_j|`. A bend
     takes a share of what speed, lateral acceleration and yaw rate allow at its place.
     """
-    # Distance between two places where the driver may slow down and the road may bend: 4 to 6 s apart.
-    pitch = 25.0 if style.winding else 30 + 2.8 * style.cruise_mps
-    count = int((s[-1] - s[0]) // pitch)
-    draw = stream(style.seed, "events").random((count, 8))
-    place = s[0] + pitch * (np.arange(count) + 0.5 + 0.4 * (draw[:, 0] - 0.5))
-    place = s[0] + NODE_M * np.rint((place - s[0]) / NODE_M)
-    slow = (draw[:, 1] < style.stops + style.slows) | style.winding
-    # Nobody stops for the first metres: a still start is the business of worlds that stand.
-    stop = (draw[:, 1] < style.stops) & (np.abs(place) > 15)
-    factor = np.where(slow, 0.15 + 0.4 * draw[:, 2], 0.88 + 0.24 * draw[:, 2])
-    target = np.where(stop, 0.0, np.minimum(style.cruise_mps * factor, TOP_SPEED_MPS))
-    if style.winding:
-        # Where lateral acceleration and yaw rate both are near what a car does.
-        target = np.where(stop, 0.0, np.minimum(style.cruise_mps, 3.5 + 4 * draw[:, 2]))
-    hold = np.where(stop, 0.0, np.where(slow, 8.0, 0.3 * pitch))
-    away = np.abs(s[:, None] - place)
+    corners = _winding_corners(style, s) if style.winding else _ordinary_corners(style, s)
+    target, hold = (np.where(corners.stop, 0.0, value) for value in (corners.target, corners.hold))
+    away = np.abs(s[:, None] - corners.place)
     squared = (target**2 + 2 * style.acceleration_mps2 * np.maximum(away - hold, 0)).min(1)
     # A car that barely moves still gets somewhere; one that stands has no speed anywhere.
     speed = np.minimum(np.sqrt(squared), min(1.15 * style.cruise_mps, TOP_SPEED_MPS))
+    node = np.rint((corners.place - s[0]) / NODE_M).astype(int)
     pause = np.zeros(len(s))
-    pause[np.rint((place[stop] - s[0]) / NODE_M).astype(int)] = (1 + 5 * draw[:, 7])[stop]
+    pause[node[corners.stop]] = corners.pause[corners.stop]
 
     limit = _curvature_limit(speed)
-    here = limit[np.rint((place - s[0]) / NODE_M).astype(int)]
-    # Corners are cut where the car slows for them; elsewhere small bends are common and strong ones rare.
-    least = 0.75 if style.winding else 0.4
-    share = np.where(slow & ~stop, least + (1 - least) * draw[:, 3], style.bends * draw[:, 3])
-    side = np.where(draw[:, 4] < 0.5, -1, 1) * (draw[:, 5] < 0.8)
-    if style.winding:
-        # Left and right by turns: so many sharp corners to one side would lead the road across itself.
-        side = np.where((np.arange(count) + style.seed) % 2, -1, 1)
-    bend = side * share * here
-    turn = np.deg2rad(10 + 90 * draw[:, 6])
-    if style.winding:
-        # The ramps at both ends of a corner take as much of its angle again.
-        turn = 1.6 * np.deg2rad(60 + 50 * draw[:, 6])
-    extent = np.clip(turn / np.maximum(np.abs(bend), 1e-6), 12.0, 0.9 * pitch)
+    bend = corners.share * limit[node]
+    extent = np.clip(corners.turn / np.maximum(np.abs(bend), 1e-6), 12.0, corners.longest)
     ramp = np.clip((0.5 - away / extent) / 0.3, 0, 1)
     curvature = (bend * ramp * ramp * (3 - 2 * ramp)).sum(1)
     curvature = np.clip(curvature, -limit, limit)
     window = np.hanning(9)[1:-1]
     return speed, pause, np.convolve(curvature, window / window.sum(), mode="same")
+
+
+def _ordinary_corners(style: Style, s: np.ndarray) -> _Corners:
+    """Return corners where the car slows for them; elsewhere small bends are common and strong ones rare."""
+    # 4 to 6 s apart.
+    pitch = 30 + 2.8 * style.cruise_mps
+    place, stop, draw = _places(style, s, pitch)
+    slow = draw[:, 1] < style.stops + style.slows
+    factor = np.where(slow, 0.15 + 0.4 * draw[:, 2], 0.88 + 0.24 * draw[:, 2])
+    share = np.where(slow & ~stop, 0.4 + 0.6 * draw[:, 3], style.bends * draw[:, 3])
+    return _Corners(
+        place=place,
+        stop=stop,
+        pause=1 + 5 * draw[:, 7],
+        target=np.minimum(style.cruise_mps * factor, TOP_SPEED_MPS),
+        hold=np.where(slow, 8.0, 0.3 * pitch),
+        share=np.where(draw[:, 4] < 0.5, -1, 1) * (draw[:, 5] < 0.8) * share,
+        turn=np.deg2rad(10 + 90 * draw[:, 6]),
+        longest=0.9 * pitch,
+    )
+
+
+def _winding_corners(style: Style, s: np.ndarray) -> _Corners:
+    """Return corner after corner, at speeds where lateral acceleration and yaw rate both are near what a car does."""
+    pitch = 25.0
+    place, stop, draw = _places(style, s, pitch)
+    share = np.where(stop, style.bends * draw[:, 3], 0.75 + 0.25 * draw[:, 3])
+    # Left and right by turns: so many sharp corners to one side would lead the road across itself.
+    side = np.where((np.arange(len(place)) + style.seed) % 2, -1, 1)
+    return _Corners(
+        place=place,
+        stop=stop,
+        pause=1 + 5 * draw[:, 7],
+        target=np.minimum(style.cruise_mps, 3.5 + 4 * draw[:, 2]),
+        hold=np.full(len(place), 8.0),
+        share=side * share,
+        # The ramps at both ends of a corner take as much of its angle again.
+        turn=1.6 * np.deg2rad(60 + 50 * draw[:, 6]),
+        longest=0.9 * pitch,
+    )
+
+
+def _places(style: Style, s: np.ndarray, pitch: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return places about `pitch` metres apart, at which of them the car stops, and a row of draws for each."""
+    count = int((s[-1] - s[0]) // pitch)
+    draw = stream(style.seed, "events").random((count, 8))
+    place = s[0] + pitch * (np.arange(count) + 0.5 + 0.4 * (draw[:, 0] - 0.5))
+    place = s[0] + NODE_M * np.rint((place - s[0]) / NODE_M)
+    # Nobody stops for the first metres: a still start is the business of worlds that stand.
+    return place, (draw[:, 1] < style.stops) & (np.abs(place) > 15), draw
 
 
 def _curvature_limit(speed: np.ndarray) -> np.ndarray:
