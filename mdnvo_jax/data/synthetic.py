@@ -196,12 +196,11 @@ def _truth(
     seed: int, frames: int, index: int, size: tuple[int, int], camera: Camera, camera_height_m: tuple[float, float]
 ) -> Truth:
     """Return `truth` of arguments that are in order."""
-    # One frame more than the drive has, for the motion of the last one.
-    whole = _world(seed, frames + 1, camera_height_m)
+    whole = _world(seed, frames, camera_height_m)
     depth, flow, moving = render.geometry(
         world.frame_at(whole, index, 1),
         world.moved_at(whole, index),
-        world.single(geometry.inverse(whole.poses[index + 1]) @ whole.poses[index]),
+        world.single(whole.motion[index]),
         world.single(camera),
         height=size[0],
         width=size[1],
