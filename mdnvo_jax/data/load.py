@@ -157,10 +157,11 @@ def _nuscenes_part(part: str, config: Config) -> list[Sequence]:
 
 def _worlds(seeds: Many[int], config: Config) -> list[Sequence]:
     """Return rendered drives from the cache where the configuration names one, else rendered when read."""
-    drives = synthetic_sequences(seeds, config)
+    from mdnvo_jax.data import synthetic
+
     if not config.data.cache:
-        return drives
-    return cache.read_cache(config.data.cache, config.image, [drive.name for drive in drives])
+        return synthetic_sequences(seeds, config)
+    return cache.read_cache(config.data.cache, config.image, [synthetic.name_of(seed) for seed in seeds])
 
 
 def synthetic_sequences(seeds: Many[int], config: Config) -> list[Sequence]:

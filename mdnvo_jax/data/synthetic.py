@@ -67,6 +67,11 @@ def varied_camera(seed: int, height: int, width: int) -> Camera:
     return fx * scale, fy * scale, cx + 0.03 * width * float(right), cy + 0.08 * height * float(down)
 
 
+def name_of(seed: int) -> str:
+    """Return the name of the drives through the world of `seed`."""
+    return f"world_{seed:06d}"
+
+
 def drive(
     seed: int,
     frames: int,
@@ -147,7 +152,7 @@ def drive(
         return frame
 
     return Sequence(
-        name=f"world_{seed:06d}",
+        name=name_of(seed),
         count=frames,
         read=read,
         timestamps=FRAME_S * np.arange(frames),
