@@ -155,10 +155,7 @@ def _open(path: Path, stored: dict[str, Any], image_config: ImageConfig) -> Sequ
     """Return the sequence that `path`, a JSON file of a cache, describes."""
     _check_fields(stored["image"], image_config, path, any_camera=not image_config.camera)
     array_file = path.with_suffix(".npy")
-    try:
-        frames = np.lib.format.open_memmap(array_file, mode="r")
-    except (OSError, ValueError) as error:
-        raise InputError(f"{array_file} is damaged ({error}): remove it and {path.name}, then prepare again") from error
+    frames = _mapped(array_file, path)
     shape = (stored["count"], *(stored["image"][field] for field in ("height", "width", "channels")))
     if frames.shape != shape or frames.dtype != np.uint8:
         raise InputError(
@@ -169,7 +166,14 @@ def _open(path: Path, stored: dict[str, Any], image_config: ImageConfig) -> Sequ
     if stored["poses"] is not None:
         poses = np.tile(np.eye(4), (stored["count"], 1, 1))
         poses[:, :3] = np.array(stored["poses"]).reshape(-1, 3, 4)
-    flow = _open_flow(path, stored) if stored.get("flow") else None
+    flow = None
+    if stored.get("flow"):
+        flow = _mapped(path.with_suffix(".flow.npy"), path)
+        if len(flow) != stored["count"]:
+            raise InputError(
+                f"{path.with_suffix('.flow.npy')} has {len(flow)} frames, expected {stored['count']}: "
+                f"remove it and {path.name}"
+            )
     return Sequence(
         name=stored["name"],
         count=stored["count"],
@@ -181,16 +185,12 @@ def _open(path: Path, stored: dict[str, Any], image_config: ImageConfig) -> Sequ
     )
 
 
-def _open_flow(path: Path, stored: dict[str, Any]) -> np.ndarray:
-    """Return the optical flow beside `path`, a JSON file of a cache."""
-    file = path.with_suffix(".flow.npy")
+def _mapped(file: Path, path: Path) -> np.ndarray:
+    """Return an array of a cache, mapped into memory; `path` is the JSON file that describes it."""
     try:
-        flow = np.lib.format.open_memmap(file, mode="r")
+        return np.lib.format.open_memmap(file, mode="r")
     except (OSError, ValueError) as error:
         raise InputError(f"{file} is damaged ({error}): remove it and {path.name}, then prepare again") from error
-    if len(flow) != stored["count"]:
-        raise InputError(f"{file} has {len(flow)} frames, expected {stored['count']}: remove it and {path.name}")
-    return flow
 
 
 def _write(
