@@ -134,7 +134,6 @@ def means_table(
     for name in dict.fromkeys(name for name, *_ in drifts):
         paths = [summary for summary in summaries if summary["name"] == name]
         scores = [found for found in calibrations if found["name"] == name and found["sigma"] == "whole mixture"]
-        scores = scores or [found for found in calibrations if found["name"] == name]
         runs = [found for of, _, _, found in drifts if of == name]
         inside = [[share.value for share in found["coverage"]["3 sigma"].values()] for found in scores]
         rows.append(
@@ -145,7 +144,7 @@ def means_table(
                 "rmse": Value(float(np.mean([path["rpe_translation_m"]["rmse"].value for path in paths]))),
                 "rotation": Value(float(np.mean([path["rpe_rotation_deg"]["mean"].value for path in paths]))),
                 "t_rel": Value(_mean_of_known([path["t_rel_percent"].value for path in paths])),
-                "bias": Value(100 * max((abs(run.speed_bias) for run in runs), default=float("nan"))),
+                "bias": Value(100 * max(abs(run.speed_bias) for run in runs)),
                 "inside": Value(100 * float(np.mean(inside, axis=0).min())),
                 "spearman_t": Value(_mean_of_known([found["spearman"]["translation"].value for found in scores])),
                 "spearman_r": Value(_mean_of_known([found["spearman"]["rotation"].value for found in scores])),
