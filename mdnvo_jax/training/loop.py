@@ -22,13 +22,7 @@ from mdnvo_jax.errors import InputError
 from mdnvo_jax.model.head import Labels
 from mdnvo_jax.model.network import Network, build
 from mdnvo_jax.training import checkpoint, initial, logs, parallel, step
-from mdnvo_jax.training.state import (
-    TRAIN_METRICS,
-    State,
-    initial_state,
-    schedule_scale,
-    state_template,
-)
+from mdnvo_jax.training.state import TRAIN_METRICS, State, initial_state, schedule_scale, state_template
 
 # Steps between two rows of TensorBoard.
 _LOG_EVERY = 10

@@ -64,8 +64,10 @@ TRAIN_METRICS = (
 
 def make_optimiser(config: TrainingConfig) -> optax.GradientTransformation:
     """Return Adam or AdamW with clipping by the global norm; the schedule's scale is applied by the step."""
-    adam = optax.adamw(config.learning_rate, b1=config.beta1, b2=config.beta2, weight_decay=config.weight_decay)
-    if not config.weight_decay:
+    if config.weight_decay:
+        adam = optax.adamw(config.learning_rate, b1=config.beta1, b2=config.beta2, weight_decay=config.weight_decay)
+    else:
+        # Not the same with a decay of 0: its state has another structure.
         adam = optax.adam(config.learning_rate, b1=config.beta1, b2=config.beta2)
     return optax.chain(optax.clip_by_global_norm(config.gradient_clip), adam) if config.gradient_clip else adam
 
