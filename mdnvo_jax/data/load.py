@@ -14,6 +14,8 @@ from mdnvo_jax.errors import InputError
 # Seeds of the synthetic worlds: those of training count from 0, the others from numbers no training reaches.
 VALIDATION_SEED = 1_000_000
 TEST_SEED = 2_000_000
+# Rows and columns of frames that other lenses take: half of KITTI's.
+_FILMED = (188, 620)
 
 
 def load_split(config: Config) -> tuple[list[Sequence], list[Sequence], ImageConfig]:
@@ -164,10 +166,16 @@ def _worlds(seeds: Many[int], config: Config) -> list[Sequence]:
     return cache.read_cache(config.data.cache, config.image, [synthetic.name_of(seed) for seed in seeds])
 
 
-def synthetic_sequences(seeds: Many[int], config: Config) -> list[Sequence]:
-    """Return a rendered drive for each seed, of `data.world_frames` frames at the network's size.
+def synthetic_sequences(seeds: Many[int], config: Config, *, other_lenses: bool = False) -> list[Sequence]:
+    """Return a rendered drive for each seed, of `data.world_frames` frames.
 
-    Frames are rendered for the virtual camera where there is one, so that nothing is left to rectify.
+    Frames are rendered at the network's size for the virtual camera where there is one, so that nothing is left to
+    rectify.
+
+    Args:
+      seeds: of the worlds.
+      config: the experiment.
+      other_lenses: render frames of `_FILMED` instead, each drive by a camera of its own, `synthetic.varied_camera`.
     """
     from mdnvo_jax.data import synthetic
     from mdnvo_jax.data.world.motion import CAMERA_HEIGHT_M
@@ -177,6 +185,7 @@ def synthetic_sequences(seeds: Many[int], config: Config) -> list[Sequence]:
     if image.camera and image.rectify:
         fx, fy, cx, cy = image.camera
         camera = fx, fy, cx, cy
+    height, width = _FILMED if other_lenses else (image.height, image.width)
     height_m = config.data.camera_height_m or None
     drawn_m = CAMERA_HEIGHT_M
     if height_m is not None:
@@ -186,10 +195,10 @@ def synthetic_sequences(seeds: Many[int], config: Config) -> list[Sequence]:
         synthetic.drive(
             seed,
             config.data.world_frames,
-            height=image.height,
-            width=image.width,
+            height=height,
+            width=width,
             channels=image.channels,
-            camera=camera,
+            camera=synthetic.varied_camera(seed, height, width) if other_lenses else camera,
             camera_height_m=drawn_m,
             scaled_to_height_m=height_m,
         )

@@ -48,7 +48,9 @@ def parser() -> Parser:
     add("--checkpoint", metavar="DIR", help="the --workdir of a training [the weights of the package]")
     add("--camera-folder", metavar="NAME", help="such as image_2 [that of the training]")
     add("--nuscenes-version", metavar="NAME", help="such as v1.0-mini [that of the training]")
-    add("--camera-height", type=float, metavar="METRES", help="of its camera above the road [that of the training]")
+    height_help = "of its camera above the road, synthetic: of all worlds' cameras [that of the training]"
+    add("--camera-height", type=float, metavar="METRES", help=height_help)
+    add("--other-lenses", action="store_true", help="synthetic: a focal length and principal point of its own a world")
     add("--mode", choices=("offline", "streaming"), default="offline", help="streaming: past alone [%(default)s]")
     add("--estimate", choices=("mean", "strongest"), default="mean", help="what a mixture is reported by [%(default)s]")
     add("--scale-sigma", type=float, metavar="SHARE", help="1-sigma error of each path's scale [fitted, or 0]")

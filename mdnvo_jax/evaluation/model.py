@@ -186,7 +186,14 @@ def sequences(options: argparse.Namespace, config: "Config") -> list["Sequence"]
         wrong = [name for name in options.sequences if not name.isdecimal()]
         if wrong:
             raise InputError(f"--sequences {wrong[0]}: expected seeds of worlds, such as {load.TEST_SEED}")
-        return load.synthetic_sequences([int(name) for name in options.sequences], config)
+        if options.camera_height is not None:
+            # Worlds of just this height, and their own metres.
+            data = dataclasses.replace(config.data, camera_height_shares=(1.0, 1.0))
+            config = dataclasses.replace(config, data=data)
+        seeds = [int(name) for name in options.sequences]
+        return load.synthetic_sequences(seeds, config, other_lenses=options.other_lenses)
+    if options.other_lenses:
+        raise InputError(f"--other-lenses is for --dataset synthetic, and this is {options.dataset}: leave it out")
     if not options.root:
         raise InputError(f"--root is missing: give the folder of {_ROOTS[options.dataset]}")
     given = {"camera_folder": options.camera_folder, "version": options.nuscenes_version}

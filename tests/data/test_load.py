@@ -103,6 +103,14 @@ def test_synthetic_worlds_are_seen_by_the_virtual_camera(asked, rectify):
     assert asked == [(2_000_000, 7, 20, 62, 1, camera if rectify else None)]
 
 
+def test_other_lenses_film_each_world_at_half_of_kittis_size(asked):
+    image = ImageConfig(height=20, width=62, channels=1, camera=(30.0, 31.0, 32.0, 9.0))
+    seeds = [load.TEST_SEED, load.TEST_SEED + 1]
+    load.synthetic_sequences(seeds, config_of("", image, world_frames=7), other_lenses=True)
+    assert asked == [(seed, 7, 188, 620, 1, synthetic.varied_camera(seed, 188, 620)) for seed in seeds]
+    assert asked[0][-1] != asked[1][-1]
+
+
 def test_a_real_renderer_takes_what_is_asked_of_it():
     """Without rendering, which compiles for seconds and has tests of its own."""
     camera = (30.0, 31.0, 32.0, 9.0)

@@ -1,5 +1,6 @@
 """A model judged on sequences: from a checkpoint and frames to tables and pictures."""
 
+import argparse
 import json
 
 import cv2
@@ -9,6 +10,7 @@ import pytest
 from mdnvo_jax import evaluate as command
 from mdnvo_jax import geometry, odometry
 from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig
+from mdnvo_jax.data import synthetic
 from mdnvo_jax.errors import exit_code
 from mdnvo_jax.evaluation import model
 from mdnvo_jax.evaluation.compare import MeanStep
@@ -142,6 +144,7 @@ def test_a_checkpoint_on_kitti(workdir, root, tmp_path, capsys):
         (["--dataset", "nuscenes", "--sequences", "scene-0001"], "--root is missing: give the folder of nuScenes"),
         (["--dataset", "nuscenes", "--sequences", "scene-0001", "--root", "{root}", "--nuscenes-version", "v1"], "v1"),
         (["--dataset", "synthetic", "--sequences", "first"], "--sequences first: expected seeds"),
+        (["--root", "{root}", "--sequences", "06", "--other-lenses"], "--other-lenses is for --dataset synthetic"),
         (["--root", "{root}", "--sequences", "11"], "no poses at"),
         (["--root", "{root}", "--sequences", "99"], "no sequence 99"),
         (["--root", "{root}", "--sequences", "06", "--block", "0"], "--block is 0"),
@@ -153,3 +156,19 @@ def test_mistakes(workdir, root, tmp_path, capsys, arguments, message):
     assert run("--checkpoint", workdir, "--output", tmp_path / "out", *given) == 2
     complaint = capsys.readouterr().err
     assert message in complaint and complaint.count("\n") == 1
+
+
+def test_worlds_of_a_known_height_are_all_seen_from_just_there():
+    height_m = 2.1
+    data = DataConfig(world_frames=3, camera_height_m=height_m, camera_height_shares=(0.7, 1.3))
+    config = Config(image=ImageConfig(height=16, width=32, camera=(20.0, 20.0, 15.5, 7.5)), data=data)
+    given = {"dataset": "synthetic", "sequences": ["5"], "other_lenses": False}
+
+    def step(known):
+        return model.sequences(argparse.Namespace(**given, camera_height=known), config)[0].poses[1, :3, 3]
+
+    drawn, known = step(None), step(height_m)
+    just = synthetic.drive(5, 3, height=16, width=32, camera_height_m=(height_m, height_m)).poses[1, :3, 3]
+    np.testing.assert_allclose(known, just, rtol=1e-9)
+    # Not scaled: the height that the world would have drawn is another one.
+    assert abs(np.linalg.norm(drawn) / np.linalg.norm(known) - 1) > 0.02
