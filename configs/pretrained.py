@@ -32,7 +32,7 @@ config = Config(
     ),
     data=DataConfig(
         dataset="synthetic",
-        worlds=800,
+        worlds=2000,
         world_frames=100,
         validation_worlds=40,
         window=12,
