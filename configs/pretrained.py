@@ -44,7 +44,7 @@ config = Config(
     ),
     training=TrainingConfig(
         batch_size=8,
-        epochs=20,
+        epochs=24,
         steps_per_epoch=450,
         schedule="cosine",
         weight_decay=1e-2,
