@@ -161,6 +161,9 @@ class TrainingConfig:
     # Start from the whole of another training: "shipped" for the weights of the package, or a checkpoint's folder. Its
     # statistics of the labels, which are the units of the outputs, are taken over. Empty: from scratch.
     initial_weights: str = ""
+    # Steps of an epoch that may be skipped because the loss, the gradient or another metric is not finite: they leave
+    # the network as it is and are counted in metrics.csv. 0: the first such step ends the training.
+    skip_nonfinite: int = 0
     # Checkpoints to keep: the newest ones, beside the best.
     keep_latest: int = 2
 

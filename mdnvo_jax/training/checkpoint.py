@@ -3,12 +3,15 @@
 import json
 import math
 import os
+import shutil
 import sys
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
+import numpy as np
 import orbax.checkpoint as ocp
+from jax.experimental import multihost_utils
 from orbax.checkpoint import checkpoint_managers
 
 from mdnvo_jax import config as configuration
@@ -16,16 +19,23 @@ from mdnvo_jax import files
 from mdnvo_jax.config import Config
 from mdnvo_jax.errors import InputError
 from mdnvo_jax.model.network import build
-from mdnvo_jax.training.state import Model, State, state_template
+from mdnvo_jax.training import checksum
+from mdnvo_jax.training.state import SKIPPED, Model, State, state_template
 
-# Raised when what is stored, or its meaning, changes.
-VERSION = 1
+# Raised when what is stored, or its meaning, changes. Version 1 has no checksums and does not count skipped steps.
+VERSION = 2
+_READABLE = (1, VERSION)
 FOLDER = "checkpoints"
+# Beside it: steps that could not be read, and for a moment the one that is being replaced.
+DAMAGED = "damaged_checkpoints"
+_REPLACED = "replaced_checkpoint"
 _METRIC = "validation_loss"
+# What orbax writes into a step's folder last.
+_FINISHED = "_CHECKPOINT_METADATA"
 # What orbax calls the one file of a JSON item.
 _JSON_FILE = "metadata"
-# What orbax raises for a checkpoint that is damaged, incomplete or of another shape.
-_DAMAGE = (ValueError, KeyError, OSError, TypeError)
+# What is raised for a checkpoint that is damaged, incomplete or of another shape depends on where the reader stumbles.
+_DAMAGE = (Exception,)
 
 
 class Restored(NamedTuple):
@@ -51,10 +61,14 @@ class Store:
             best_mode="min",
             cleanup_tmp_directories=True,
         )
-        self._manager = ocp.CheckpointManager((workdir / FOLDER).absolute(), options=options)
+        recover(workdir)
+        self._workdir = workdir.absolute()
+        self._manager = ocp.CheckpointManager(self._workdir / FOLDER, options=options)
 
     def save(self, state: State, data_state: Any, config: Config, validation_loss: float = math.inf) -> None:
         """Start to save the training; it goes on in the background.
+
+        A checkpoint of the same step, left by a training that was stopped before it could validate, is replaced.
 
         Args:
           state: the state after a whole number of steps.
@@ -62,48 +76,106 @@ class Store:
           config: the experiment, with the image configuration resolved.
           validation_loss: infinite where this state was not validated, so that it never counts as the best.
         """
-        self._manager.save(
-            int(state.step),
+        step = int(state.step)
+        replaces = step in self._manager.all_steps()
+        if replaces:
+            self.wait()
+            self._move(step, _REPLACED)
+        data = {"iterator": data_state}
+        training = _without_model(state)
+        checksums = {
+            "model": checksum.of_arrays(state.model),
+            "training": checksum.of_arrays(training),
+            "data": checksum.of_json(data),
+        }
+        saved = self._manager.save(
+            step,
             args=ocp.args.Composite(
                 model=ocp.args.StandardSave(state.model),
-                training=ocp.args.StandardSave(_without_model(state)),
-                data=ocp.args.JsonSave({"iterator": data_state}),
-                about=ocp.args.JsonSave(_about(config)),
+                training=ocp.args.StandardSave(training),
+                data=ocp.args.JsonSave(data),
+                about=ocp.args.JsonSave(_about(config, checksums)),
             ),
             metrics={_METRIC: validation_loss},
         )
+        # Orbax saves nothing, and says nothing, where it knows of a later step.
+        assert saved, f"step {step} was not saved: {self.steps()} are there"
+        if replaces:
+            self.wait()
+            recover(self._workdir)
 
     def steps(self) -> list[int]:
         """Return the steps that have a checkpoint, newest first."""
         return sorted(self._manager.all_steps(read=True), reverse=True)
 
     def restore(self, template: State) -> Restored:
-        """Return the newest checkpoint that can be read.
+        """Return the newest checkpoint that is whole; newer ones are moved to `DAMAGED`, with a warning.
 
         Args:
           template: a state of the shapes, types and shardings to restore.
 
         Raises:
-          InputError: there is none.
+          InputError: there is none, or the newest is of a version that this release does not read.
         """
+        damaged: dict[int, str] = {}
         for step in self.steps():
             try:
-                found = self._manager.restore(
-                    step,
-                    args=ocp.args.Composite(
-                        model=ocp.args.StandardRestore(template.model),
-                        training=ocp.args.StandardRestore(_without_model(template)),
-                        data=ocp.args.JsonRestore(),
-                    ),
-                )
+                restored = self._restore(step, template)
+            except InputError:
+                raise
             except _DAMAGE as error:
-                print(
-                    f"warning: checkpoint {step} cannot be read, trying an older one ({_first(error)})", file=sys.stderr
-                )
+                damaged[step] = _first(error)
                 continue
-            state = State(model=found.model, **found.training)
-            return Restored(state, found.data["iterator"], step)
-        raise InputError(f"no readable checkpoint in {self._manager.directory}: start again without --resume")
+            for number, why in damaged.items():
+                # Out of the way: a step is saved once, and this training will come to it again.
+                place = self._move(number, DAMAGED)
+                print(
+                    f"warning: checkpoint {number} cannot be read and is now {place}; "
+                    f"going on from step {step} ({why})",
+                    file=sys.stderr,
+                )
+            return restored
+        raise InputError(
+            f"none of the {len(damaged)} checkpoints in {self._manager.directory} can be read "
+            f"({'; '.join(f'{step}: {why}' for step, why in damaged.items())}): start again in another --workdir"
+        )
+
+    def _restore(self, step: int, template: State) -> Restored:
+        """Return the checkpoint of one step."""
+        folder = Path(self._manager.directory) / str(step)
+        about = _read_about(folder)
+        training = _without_model(template)
+        if about["version"] == 1:
+            training["sums"] = {name: leaf for name, leaf in training["sums"].items() if name != SKIPPED}
+        for item in ("model", "training"):
+            checksum.check_stored(folder / item, about.get("checksums", {}).get(item))
+        found = self._manager.restore(
+            step,
+            args=ocp.args.Composite(
+                model=ocp.args.StandardRestore(template.model),
+                training=ocp.args.StandardRestore(training),
+                data=ocp.args.JsonRestore(),
+            ),
+        )
+        if about["version"] == 1:
+            leaf = template.sums[SKIPPED]
+            found.training["sums"][SKIPPED] = jax.device_put(np.zeros(leaf.shape, leaf.dtype), leaf.sharding)
+        else:
+            checksum.check_json(found.data, about["checksums"]["data"], "data")
+        return Restored(State(model=found.model, **found.training), found.data["iterator"], step)
+
+    def _move(self, step: int, name: str) -> Path:
+        """Move a step's folder into the folder `name` beside the checkpoints, and return where it is now."""
+        place = self._workdir / name / str(step)
+        if jax.process_index() == 0:
+            place.parent.mkdir(exist_ok=True)
+            while place.exists():
+                place = place.with_name(f"{place.name}+")
+            (self._workdir / FOLDER / str(step)).rename(place)
+        if jax.process_count() > 1:
+            multihost_utils.sync_global_devices(f"moved checkpoint {step}")
+        self._manager.reload()
+        return place
 
     def wait(self) -> None:
         """Return when everything that was saved is on disk."""
@@ -114,9 +186,22 @@ class Store:
         self._manager.close()
 
 
-def _about(config: Config) -> dict[str, Any]:
-    """Return what a checkpoint says about itself."""
-    return {"version": VERSION, "config": json.loads(configuration.as_json(config))}
+def recover(workdir: Path) -> None:
+    """Bring a training's folder in order that ended while a checkpoint was replaced by another of the same step."""
+    for old in (workdir / _REPLACED).glob("*"):
+        new = workdir / FOLDER / old.name
+        if (new / _FINISHED).exists():
+            shutil.rmtree(old)
+        else:
+            old.rename(new)
+    if (workdir / _REPLACED).is_dir():
+        (workdir / _REPLACED).rmdir()
+
+
+def _about(config: Config, checksums: dict[str, Any]) -> dict[str, Any]:
+    """Return what a checkpoint says about itself, given the checksums of its other items."""
+    stored = json.loads(configuration.as_json(config))
+    return {"version": VERSION, "config": stored, "checksums": {**checksums, "config": checksum.of_json(stored)}}
 
 
 def _without_model(state: State) -> dict[str, Any]:
@@ -131,7 +216,7 @@ def _metric(metrics: dict[str, float]) -> float:
 
 def _first(error: BaseException) -> str:
     """Return the first line of an error, shortened."""
-    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0][:120]}"
+    return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0][:160]}"
 
 
 def abstract(tree: Any, sharding: jax.sharding.Sharding | None = None) -> Any:
@@ -141,8 +226,15 @@ def abstract(tree: Any, sharding: jax.sharding.Sharding | None = None) -> Any:
 
 def steps_in(folder: Path) -> list[int]:
     """Return the steps that have a non-empty folder in the checkpoint folder, newest first."""
-    found = [entry for entry in folder.iterdir() if entry.name.isdigit() and (entry / "_CHECKPOINT_METADATA").exists()]
+    found = [entry for entry in folder.iterdir() if entry.name.isdigit() and (entry / _FINISHED).exists()]
     return sorted((int(entry.name) for entry in found), reverse=True)
+
+
+def any_step(workdir: Path) -> bool:
+    """Return whether a training has left a step's folder in `workdir`, be it damaged."""
+    recover(workdir)
+    folder = workdir / FOLDER
+    return folder.is_dir() and any(entry.name.isdigit() for entry in folder.iterdir())
 
 
 def locate(path: str | os.PathLike[str]) -> Path:
@@ -175,22 +267,43 @@ def read_config(step_folder: Path) -> Config:
     Raises:
       InputError: it is unreadable, or of another version.
     """
+    try:
+        about = _read_about(step_folder)
+        return configuration.from_json(json.dumps(about["config"]))
+    except InputError:
+        raise
+    except _DAMAGE as error:
+        raise InputError(f"the checkpoint {step_folder} is damaged or none of ours ({_first(error)})") from error
+
+
+def _read_about(step_folder: Path) -> dict[str, Any]:
+    """Return what a step's checkpoint says about itself.
+
+    Raises:
+      InputError: it is of a version that this release does not read.
+      Exception: it is damaged.
+    """
     with ocp.Checkpointer(ocp.JsonCheckpointHandler()) as reader:
-        try:
-            about = reader.restore(step_folder / "about")
-        except _DAMAGE as error:
-            raise InputError(f"the checkpoint {step_folder} is damaged or none of ours ({_first(error)})") from error
-    if about["version"] != VERSION:
+        about = reader.restore(step_folder / "about")
+    version = about["version"]
+    if version not in _READABLE:
+        newer = isinstance(version, int) and version > VERSION
         raise InputError(
-            f"the checkpoint {step_folder} has version {about['version']}, expected {VERSION}: "
-            "use the release of mdnvo_jax that wrote it"
+            f"the checkpoint {step_folder} has version {version}, expected {' or '.join(map(str, _READABLE))}: "
+            + ("it was written by a newer release of mdnvo_jax; install that one" if newer else "it is none of ours")
         )
-    return configuration.from_json(json.dumps(about["config"]))
+    if version > 1:
+        checksum.check_json(about["config"], about["checksums"]["config"], "config")
+    return about
 
 
 def write_about(step_folder: Path, config: Config) -> None:
-    """Put another experiment into a copy of a step's folder, for `read_config`."""
-    files.write_text(step_folder / "about" / _JSON_FILE, json.dumps(_about(config)))
+    """Put another experiment into a copy of a step's folder, for `read_config`; its checksums of the model stay."""
+    checksums = _read_about(step_folder).get("checksums", {})
+    about = _about(config, {name: value for name, value in checksums.items() if name == "model"})
+    if not checksums:
+        about = {"version": 1, "config": about["config"]}
+    files.write_text(step_folder / "about" / _JSON_FILE, json.dumps(about))
 
 
 def trained(path: str | os.PathLike[str]) -> tuple[Model, Config, Path]:
@@ -216,6 +329,7 @@ def read_model(step_folder: Path, template: Model) -> Model:
       InputError: it is damaged or its shapes are not those of `template`.
     """
     try:
+        checksum.check_stored(step_folder / "model", _read_about(step_folder).get("checksums", {}).get("model"))
         # Orbax notices a wrong shape too, but late, and leaves half-done reads behind.
         stored = _shapes(ocp.StandardCheckpointHandler().metadata(step_folder / "model").tree)
         expected = _shapes(template)
@@ -224,6 +338,8 @@ def read_model(step_folder: Path, template: Model) -> Model:
             raise ValueError(f"{wrong[0]} is {stored.get(wrong[0])}, expected {expected.get(wrong[0])}")
         with ocp.Checkpointer(ocp.StandardCheckpointHandler()) as reader:
             return reader.restore(step_folder / "model", args=ocp.args.StandardRestore(template))
+    except InputError:
+        raise
     except _DAMAGE as error:
         raise InputError(
             f"the checkpoint {step_folder} is damaged or does not fit its own configuration ({_first(error)})"

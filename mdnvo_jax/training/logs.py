@@ -40,7 +40,9 @@ class Logs:
         """Add a row to metrics.csv, which is rewritten whole, and its values to TensorBoard."""
         self._rows.append({name: _number(value) for name, value in row.items()})
         text = io.StringIO()
-        writer = csv.DictWriter(text, list(self._rows[0]), lineterminator="\n")
+        # Rows of an older release may have fewer columns.
+        columns = dict.fromkeys(name for row in reversed(self._rows) for name in row)
+        writer = csv.DictWriter(text, list(columns), restval="", lineterminator="\n")
         writer.writeheader()
         writer.writerows(self._rows)
         files.write_text(self._csv, text.getvalue())

@@ -22,7 +22,14 @@ from mdnvo_jax.errors import InputError
 from mdnvo_jax.model.head import Labels
 from mdnvo_jax.model.network import Network, build
 from mdnvo_jax.training import checkpoint, initial, logs, parallel, step
-from mdnvo_jax.training.state import TRAIN_METRICS, State, initial_state, schedule_scale, state_template
+from mdnvo_jax.training.state import (
+    SKIPPED,
+    TRAIN_METRICS,
+    State,
+    initial_state,
+    schedule_scale,
+    state_template,
+)
 
 # Steps between two rows of TensorBoard.
 _LOG_EVERY = 10
@@ -114,7 +121,7 @@ def train(config: Config, workdir: Path, *, resume: bool = False) -> str:
 
 def _claim(workdir: Path, resume: bool) -> None:
     """Make `workdir`, or refuse: a training is neither overwritten nor resumed by accident."""
-    found = (workdir / checkpoint.FOLDER).is_dir() and checkpoint.steps_in(workdir / checkpoint.FOLDER)
+    found = checkpoint.any_step(workdir)
     if found and not resume:
         raise InputError(f"{workdir} holds checkpoints of a training: go on with --resume, or choose another --workdir")
     if resume and not found:
@@ -195,8 +202,10 @@ class _Run:
                     message = f"stopped by {stop.signal.name} after step {int(state.step)}; go on with --resume"
                     raise Stopped(message, stop.signal)
                 state, row = self.validate(state, validation(), epoch)
-                self.store.save(state, batches.get_state(), self.config, row["validation_loss"])
+                # A row of a step that no checkpoint has is dropped by whoever resumes; the other way round it would
+                # be missing for good.
                 self.logs.epoch(row)
+                self.store.save(state, batches.get_state(), self.config, row["validation_loss"])
                 best = min(best, row["validation_loss"])
                 print(_epoch_line(row), flush=True)
         self.store.wait()
@@ -230,11 +239,21 @@ class _Run:
         return state
 
     def inspect(self, metrics: dict[str, jax.Array], number: int) -> None:
-        """Stop at the first value that is not finite; write every few steps' metrics to TensorBoard."""
+        """Stop at values that are not finite, or count them; write every few steps' metrics to TensorBoard."""
         bad = [name for name in TRAIN_METRICS if not math.isfinite(metrics[name])]
+        limit = self.config.training.skip_nonfinite
+        if bad and metrics[SKIPPED] <= limit and limit:
+            print(
+                f"warning: step {number} is skipped, {', '.join(bad)} not finite: {int(metrics[SKIPPED])} in this "
+                f"epoch, training.skip_nonfinite allows {limit}",
+                file=sys.stderr,
+            )
+            return
         if bad:
             raise NonFiniteError(
-                f"{', '.join(bad)} not finite at step {number}: lower training.learning_rate or "
+                f"{', '.join(bad)} not finite at step {number}"
+                + (f", after {limit} steps of this epoch were skipped" if limit else "")
+                + ": lower training.learning_rate or "
                 f"training.gradient_clip; the last good checkpoint in {self.workdir / checkpoint.FOLDER} is kept"
             )
         if number % _LOG_EVERY == 0:
@@ -246,12 +265,14 @@ class _Run:
         for batch in batches:
             found = self.validation_step(state.model, parallel.place(batch, self.mesh))
             sums = found if sums is None else jax.tree.map(jax.numpy.add, sums, found)
+        skipped = int(state.sums[SKIPPED])
         row = {
             "epoch": epoch + 1,
             "step": int(state.step),
             "learning_rate": self.config.training.learning_rate
             * float(schedule_scale(self.config.training, state.plateau, state.step)),
-            **{name: float(state.sums[name]) / self.steps_per_epoch for name in TRAIN_METRICS},
+            **{name: float(state.sums[name]) / max(self.steps_per_epoch - skipped, 1) for name in TRAIN_METRICS},
+            SKIPPED: skipped,
             **{name: float(value) for name, value in step.validation_metrics(sums).items()},
         }
         if not math.isfinite(row["validation_loss"]):
@@ -265,4 +286,5 @@ def _epoch_line(row: dict[str, float]) -> str:
         f"epoch {row['epoch']:>3}  step {row['step']:>6}  loss {row['loss']:8.4f}  "
         f"validation {row['validation_loss']:8.4f}  {row['validation_translation_rmse_m']:.4f} m  "
         f"{row['validation_rotation_rmse_deg']:.4f} deg  rate {row['learning_rate']:.2e}"
+        + (f"  skipped {row[SKIPPED]}" if row[SKIPPED] else "")
     )

@@ -39,7 +39,8 @@ class State(NamedTuple):
       rng: key that every step folds its number into.
       step: steps taken.
       epoch: epochs finished, validation included.
-      sums: running sums of the metrics over the epoch, so that a resumed epoch reports the means of all of it.
+      sums: running sums of the metrics over the epoch, so that a resumed epoch reports the means of all of it; and
+        under `SKIPPED` how many of its steps were skipped, whose metrics are not in the sums.
     """
 
     model: Model
@@ -60,6 +61,8 @@ TRAIN_METRICS = (
     *(f"sigma_translation_m_q{percent}" for percent in (10, 50, 90)),
     *(f"sigma_rotation_rad_q{percent}" for percent in (10, 50, 90)),
 )
+# Steps of an epoch, so far, that changed nothing, because a number in them was not finite.
+SKIPPED = "skipped"
 
 
 def make_optimiser(config: TrainingConfig) -> optax.GradientTransformation:
@@ -118,7 +121,7 @@ def initial_state(variables: Any, config: Config, labels: Labels) -> State:
         step=jnp.zeros((), jnp.int32),
         epoch=jnp.zeros((), jnp.int32),
         # A zero of its own each: the step donates the state, and a buffer can be donated once.
-        sums={name: jnp.zeros((), jnp.float32) for name in TRAIN_METRICS},
+        sums={name: jnp.zeros((), jnp.float32) for name in (*TRAIN_METRICS, SKIPPED)},
     )
 
 

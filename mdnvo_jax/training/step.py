@@ -12,7 +12,15 @@ from mdnvo_jax import mixture
 from mdnvo_jax.config import Config
 from mdnvo_jax.model.head import Labels, mixture_from_outputs, regression_loss
 from mdnvo_jax.model.network import Network
-from mdnvo_jax.training.state import TRAIN_METRICS, Model, State, make_optimiser, make_plateau, schedule_scale
+from mdnvo_jax.training.state import (
+    SKIPPED,
+    TRAIN_METRICS,
+    Model,
+    State,
+    make_optimiser,
+    make_plateau,
+    schedule_scale,
+)
 
 # Pixels of the map of optical flow: longer flow is cut to this, and the loss is round below that.
 _LARGEST_FLOW = 8.0
@@ -101,6 +109,9 @@ def flow_loss(predicted: jax.Array, flow: jax.Array) -> jax.Array:
 def train_step(state: State, batch: Batch, *, network: Network, config: Config) -> tuple[State, Metrics]:
     """Take one step of Adam on one batch.
 
+    With `training.skip_nonfinite`, a step with a metric that is infinite or not a number changes nothing but two
+    counts, of steps and of skipped ones: the next step has another batch, another dropout and the rate of its number.
+
     Args:
       state: the state so far.
       batch: `images` `[B, T+1, H, W, C]` uint8, `steps` `[B, T, 6]`, `mask` `[B, T]`.
@@ -108,7 +119,8 @@ def train_step(state: State, batch: Batch, *, network: Network, config: Config) 
       config: the experiment.
 
     Returns:
-      The next state, and the metrics `TRAIN_METRICS` of this step, each a scalar.
+      The next state, and the metrics `TRAIN_METRICS` of this step, each a scalar; `SKIPPED` counts the steps skipped
+      in this epoch.
     """
     model = state.model
 
@@ -132,13 +144,17 @@ def train_step(state: State, batch: Batch, *, network: Network, config: Config) 
     norms = [optax.tree.norm(tree) for tree in (gradient, update, params)]
     predicted = mixture_from_outputs(outputs, model.labels, config.model, model.residual_scale)
     metrics = dict(zip(TRAIN_METRICS, [loss, *norms, *_sigma_quantiles(predicted, batch["mask"])], strict=True))
+    sums = {name: state.sums[name] + value for name, value in metrics.items()}
     next_state = state._replace(
         model=model._replace(params=params, batch_stats=batch_stats),
         optimiser=optimiser,
-        step=state.step + 1,
-        sums=jax.tree.map(jnp.add, state.sums, metrics),
+        sums={**sums, SKIPPED: state.sums[SKIPPED]},
     )
-    return next_state, metrics
+    if config.training.skip_nonfinite:
+        finite = jnp.isfinite(jnp.stack(list(metrics.values()))).all()
+        next_state = jax.tree.map(lambda new, old: jnp.where(finite, new, old), next_state, state)
+        next_state.sums[SKIPPED] += ~finite
+    return next_state._replace(step=state.step + 1), {**metrics, SKIPPED: next_state.sums[SKIPPED]}
 
 
 def _sigma_quantiles(predicted: mixture.Mixture, mask: jax.Array) -> list[jax.Array]:

@@ -9,15 +9,16 @@ from pathlib import Path
 
 import cv2
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from mdnvo_jax import train
-from mdnvo_jax.config import from_json
+from mdnvo_jax.config import Config, TrainingConfig, from_json
 from mdnvo_jax.errors import exit_code
 from mdnvo_jax.model.network import build
-from mdnvo_jax.training import checkpoint, logs
-from mdnvo_jax.training.state import State, state_template
+from mdnvo_jax.training import checkpoint, logs, loop, parallel
+from mdnvo_jax.training.state import SKIPPED, TRAIN_METRICS, State, make_plateau, state_template
 
 CONFIG = """
 from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig, TrainingConfig
@@ -186,6 +187,56 @@ def test_a_training_that_diverges_stops_and_keeps_its_last_checkpoint(config_fil
     np.testing.assert_array_equal(
         before.model.params["head"]["kernel"], last_state(tmp_path).model.params["head"]["kernel"]
     )
+
+
+def idle_run(workdir: Path, limit: int) -> loop._Run:
+    """What a training is made of, of four steps an epoch, without a network."""
+    config = Config(training=TrainingConfig(skip_nonfinite=limit))
+    run = object.__new__(loop._Run)
+    run.config, run.workdir, run.mesh, run.steps_per_epoch = config, workdir, parallel.make_mesh(1, 1), 4
+    run.validation_step = lambda model, batch: {"loss": 1.0, "count": 1, "squares": np.zeros(6)}
+    run.end_epoch = lambda state, sums: state
+    return run
+
+
+def metrics_of(skipped: int, **values: float) -> dict[str, np.ndarray]:
+    return {name: np.float32(value) for name, value in {**dict.fromkeys(TRAIN_METRICS, 1.0), **values}.items()} | {
+        SKIPPED: np.float32(skipped)
+    }
+
+
+def test_steps_that_are_not_finite_are_told_of_up_to_a_limit(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = idle_run(tmp_path, limit=2)
+    run.inspect(metrics_of(2, loss=np.nan, gradient_norm=np.inf), 7)
+    assert capsys.readouterr().err == (
+        "warning: step 7 is skipped, loss, gradient_norm not finite: 2 in this epoch, "
+        "training.skip_nonfinite allows 2\n"
+    )
+    run.inspect(metrics_of(2), 8)
+    assert capsys.readouterr().err == ""
+    with pytest.raises(loop.NonFiniteError, match="loss not finite at step 9, after 2 steps of this epoch were skip"):
+        run.inspect(metrics_of(3, loss=np.nan), 9)
+    with pytest.raises(loop.NonFiniteError, match="loss not finite at step 1: lower"):
+        idle_run(tmp_path, limit=0).inspect(metrics_of(0, loss=np.nan), 1)
+
+
+def test_skipped_steps_are_in_the_row_of_their_epoch_and_out_of_its_means(tmp_path: Path) -> None:
+    sums = {**dict.fromkeys(TRAIN_METRICS, jnp.float32(6.0)), SKIPPED: jnp.float32(1)}
+    state = State(None, None, make_plateau(TrainingConfig()).init({}), None, jnp.int32(4), jnp.int32(0), sums)
+    _, row = idle_run(tmp_path, limit=2).validate(state, [{"mask": np.ones((1, 1), bool)}], 0)
+    assert (row["loss"], row[SKIPPED]) == (2.0, 1)
+    assert loop._epoch_line(row).endswith("  skipped 1")
+    assert "skipped" not in loop._epoch_line(row | {SKIPPED: 0})
+
+
+def test_rows_of_an_older_release_keep_their_columns(tmp_path: Path) -> None:
+    (tmp_path / "metrics.csv").write_text("epoch,step,loss\n1,11,0.5\n")
+    written = logs.Logs(tmp_path, 11)
+    written.epoch({"epoch": 2, "step": 22, "loss": 0.25, "skipped": 1})
+    written.close()
+    assert [row["skipped"] for row in rows(tmp_path)] == ["", "1"]
 
 
 @pytest.mark.parametrize(

@@ -17,6 +17,7 @@ from mdnvo_jax.model.head import Labels
 from mdnvo_jax.model.network import build
 from mdnvo_jax.training import step
 from mdnvo_jax.training.state import (
+    SKIPPED,
     TRAIN_METRICS,
     State,
     initial_state,
@@ -76,6 +77,38 @@ def test_training_on_one_batch_learns_it(head: str) -> None:
     for name in TRAIN_METRICS:
         assert np.isfinite(metrics[name])
     np.testing.assert_allclose(state.sums["loss"], sum(losses), rtol=1e-4)
+
+
+class Linear:
+    """A network whose outputs are its parameter times the brightness of a frame: it compiles in no time."""
+
+    def apply(self, variables, images, mask, **_):
+        brightness = images[:, 1:].mean((2, 3, 4))[..., None] / 255
+        outputs = brightness * variables["params"]["head"]
+        return (outputs, None), {"batch_stats": {"mean": brightness.mean()}}
+
+
+def test_a_step_that_is_not_finite_is_skipped_and_counted() -> None:
+    size = mixture.outputs_size(CONFIG.model.components)
+    variables = {"params": {"head": jnp.full(size, 0.1)}, "batch_stats": {"mean": jnp.zeros(())}}
+    config = with_(CONFIG, training={"skip_nonfinite": 2})
+    good, bad = make_batch(), make_batch()
+    bad["steps"] = bad["steps"].at[1, 0, 3].set(jnp.nan)
+    train_step = jax.jit(step.bind(step.train_step, Linear(), config))
+    before, metrics = train_step(initial_state(variables, config, LABELS), good)
+    assert metrics[SKIPPED] == 0
+    after, metrics = train_step(before, bad)
+    assert not np.isfinite(metrics["loss"]) and metrics[SKIPPED] == 1
+    counted = before._replace(step=before.step + 1, sums={**before.sums, SKIPPED: 1.0})
+    jax.tree.map(np.testing.assert_array_equal, after, counted)
+    # Training goes on from there, and the sums are those of the steps that counted.
+    later, metrics = train_step(after, good)
+    assert np.isfinite(metrics["loss"]) and metrics[SKIPPED] == 1
+    np.testing.assert_allclose(later.sums["loss"], before.sums["loss"] + metrics["loss"], rtol=1e-6)
+    assert (later.model.params["head"] != before.model.params["head"]).any()
+    # Without the option nothing is hidden: whoever looks at the metrics stops.
+    spoilt, metrics = jax.jit(step.bind(step.train_step, Linear(), CONFIG))(before, bad)
+    assert metrics[SKIPPED] == 0 and np.isnan(spoilt.model.params["head"]).any()
 
 
 def test_every_step_draws_its_own_dropout_and_the_same_one_again() -> None:
