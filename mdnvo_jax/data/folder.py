@@ -115,6 +115,18 @@ def natural_key(text: str) -> tuple[list[tuple[int, int, str]], str]:
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts], text
 
 
+# How videos begin: Matroska and WebM, AVI, MPEG (program and elementary streams, H.264, H.265), FLV, Ogg, WMV, IVF,
+# Y4M.
+_STARTS = (
+    *(b"\x1aE\xdf\xa3", b"RIFF", b"\0\0\x01", b"\0\0\0\x01", b"FLV\x01", b"OggS"),
+    *(b"0&\xb2u\x8ef\xcf\x11", b"DKIF", b"YUV4MPEG2 "),
+)
+# The kinds of the first atom of MP4 and MOV files, after its length.
+_ATOMS = (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot")
+# Bytes of a packet of an MPEG transport stream; each begins with a G.
+_PACKET = 188
+
+
 class Video:
     """A video file read frame by frame, holding one decoder and one frame whatever its length.
 
@@ -155,7 +167,7 @@ class Video:
             return self._last
 
     def _open(self) -> None:
-        self._capture = cv2.VideoCapture(self.path)
+        self._capture = cv2.VideoCapture(self.path, cv2.CAP_FFMPEG)
         if not self._capture.isOpened():
             raise InputError(f"{self.path} cannot be opened as a video: expected a folder, a glob or a video file")
         self._next = 0
@@ -182,7 +194,14 @@ class Video:
 
 def _find(images: str | Path, channels: int) -> Sequence:
     """Return every frame at `images`."""
-    path = Path(images)
+    try:
+        return _found(Path(images), images, channels)
+    except OSError as error:
+        raise InputError(f"cannot read {str(images)[:200]} ({error.strerror}): expected frames") from error
+
+
+def _found(path: Path, images: str | Path, channels: int) -> Sequence:
+    """Return every frame at `images`, which is `path` where it is no glob."""
     if path.is_dir():
         return _directory(path, channels)
     if path.is_file():
@@ -239,10 +258,26 @@ def _files(name: str, files: Many[Path], channels: int) -> Sequence:
     )
 
 
+def _is_video(path: Path) -> bool:
+    """Return whether a file begins as a video does.
+
+    A playlist is none: the decoder would follow it to other files and hosts than the one that the user named.
+    """
+    with path.open("rb") as file:
+        data = file.read(2 * _PACKET)
+    transport = data[:1] == b"G" and data[_PACKET : _PACKET + 1] in (b"G", b"")
+    return transport or data[4:8] in _ATOMS or any(data.startswith(start) for start in _STARTS)
+
+
 def _video(path: Path, channels: int) -> Sequence:
     """Return a video file as a sequence."""
     if path.suffix.lower() in pictures.SUFFIXES:
         raise InputError(f"{path} is one picture: expected a folder of pictures, a glob in quotes, or a video file")
+    if not _is_video(path):
+        raise InputError(
+            f"{path} is no video of a kind that is read: expected MP4, MOV, AVI, Matroska, WebM, MPEG, H.264, H.265, "
+            "FLV, Ogg, WMV or Y4M; convert it, or give a folder of pictures"
+        )
     video = Video(path, channels)
     rate = video.frame_rate_hz
     return Sequence(

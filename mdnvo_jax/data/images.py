@@ -11,13 +11,21 @@ import cv2
 import numpy as np
 
 from mdnvo_jax.config import ImageConfig
+from mdnvo_jax.data import picture_header
 from mdnvo_jax.data.sequence import Camera
 from mdnvo_jax.errors import InputError
 
 # File names that count as pictures in a folder.
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp", ".pgm", ".ppm")
+# A picture may have as many pixels as 8192 x 8192: decoded they take 200 MB, and 400 MB with 16 bits. Cameras stay far
+# below; what states more would be decoded into as much memory as it likes.
+MOST_PIXELS = 1 << 26
+# And its file as many bytes as these pixels would take with four channels of 16 bits, not compressed.
+_MOST_BYTES = 8 * MOST_PIXELS
 # 65535 / 255: the full range of 16 bits becomes the full range of 8.
 _SIXTEEN_BIT_SCALE = 257.0
+# In lengths of the frame: a principal point further off than this is no camera's.
+_FURTHEST = 1000
 # Linear interpolation may step over this many source pixels a sample before it is refined: 1.25 loses little detail,
 # and spares the common small excesses over a whole factor (KITTI to 608 is 2.04) half as many samples again.
 _LONGEST_STEP = 1.25
@@ -30,14 +38,17 @@ def read_image(path: str | Path, channels: int) -> np.ndarray:
     rotation in the EXIF data is applied. Of several pictures in one file the first is taken.
 
     Raises:
-      InputError: the file is missing, is no picture, is cut short, or holds neither 8 nor 16 bit samples.
+      InputError: the file is missing, is no picture, is cut short, is larger than `MOST_PIXELS`, or holds neither 8 nor
+        16 bit samples.
     """
-    try:
-        data = Path(path).read_bytes()
-    except OSError as error:
-        raise InputError(f"cannot read {path} ({error.strerror}): expected a picture") from error
+    data = _content(Path(path))
     if _cut_short(data):
         raise InputError(f"{path} is cut short ({len(data)} bytes): expected a whole picture; copy it again")
+    stated = picture_header.size(data)
+    if stated is None:
+        raise InputError(f"{path} cannot be decoded: expected a picture ({', '.join(SUFFIXES)})")
+    if stated[0] * stated[1] > MOST_PIXELS:
+        raise InputError(f"{path} states {stated[0]}x{stated[1]} pixels: expected {MOST_PIXELS} or fewer in all")
     flags = cv2.IMREAD_GRAYSCALE if channels == 1 else cv2.IMREAD_COLOR_BGR
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags | cv2.IMREAD_ANYDEPTH)
@@ -53,6 +64,21 @@ def read_image(path: str | Path, channels: int) -> np.ndarray:
         # Not left to the decoder: OpenCV 5.0 asked for RGB gives black for TIFF with 16 bits.
         cv2.cvtColor(image, cv2.COLOR_BGR2RGB, dst=image)
     return image.reshape(*image.shape[:2], channels)
+
+
+def _content(path: Path) -> bytes:
+    """Return what is in a file, which must be one: reading a pipe would wait for ever."""
+    try:
+        if path.exists() and not path.is_file():
+            raise InputError(f"{path} is no file: expected a picture")
+        if (count := path.stat().st_size) > _MOST_BYTES:
+            raise InputError(f"{path} has {count} bytes: expected a picture, of {_MOST_BYTES} or fewer")
+        return path.read_bytes()
+    except (OSError, ValueError) as error:
+        if isinstance(error, InputError):
+            raise
+        why = error.strerror if isinstance(error, OSError) else error
+        raise InputError(f"cannot read {path} ({why}): expected a picture") from error
 
 
 def as_channels(image: np.ndarray, channels: int) -> np.ndarray:
@@ -89,10 +115,16 @@ def prepare(image: np.ndarray, camera: Camera | None, image_config: ImageConfig)
       image_config: size, channels and virtual camera.
 
     Raises:
-      InputError: the frame is not uint8 of 1 or 3 channels.
+      InputError: the frame is not uint8 of 1 or 3 channels, or `camera` is not that of a frame of this size.
     """
     image = as_channels(image, image_config.channels)
     columns, rows = _source_axes(image.shape[:2], camera, image_config)
+    for (step, start), length in ((columns, image.shape[1]), (rows, image.shape[0])):
+        if not (abs(step) <= length and abs(start) <= _FURTHEST * length):
+            raise InputError(
+                f"camera {camera} of a frame of {image.shape[1]}x{image.shape[0]} pixels: expected fx, fy, cx, cy in "
+                "pixels of that frame"
+            )
     if image.shape[:2] == (image_config.height, image_config.width) and _identity(*columns) and _identity(*rows):
         return image
     return resample(image, columns, rows, (image_config.height, image_config.width))

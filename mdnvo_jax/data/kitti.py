@@ -15,6 +15,8 @@ from mdnvo_jax.errors import InputError
 
 # Equatorial radius of the WGS 84 ellipsoid, m.
 _EARTH_RADIUS_M = 6378137.0
+# Larger numbers are no metres, pixels or seconds; their squares would not be finite.
+_LARGEST = 1e100
 # How far R R^T may be from the identity: the seven digits of the files leave 1e-6, a transposition or a wrong column 1.
 _ROTATION_TOLERANCE = 1e-3
 
@@ -258,7 +260,10 @@ def _intrinsics_of(projection: np.ndarray) -> Camera:
 def _offset_of(projection: np.ndarray) -> np.ndarray:
     """Return `T_camera0_camera` of a rectified camera: its projection is `K [I | t]`, with t from camera 0 to it."""
     offset = np.eye(4)
-    offset[:3, 3] = -np.linalg.solve(projection[:, :3], projection[:, 3])
+    try:
+        offset[:3, 3] = -np.linalg.solve(projection[:, :3], projection[:, 3])
+    except np.linalg.LinAlgError as error:
+        raise InputError(f"calibration: {projection[:, :3].tolist()} is no matrix of a camera's intrinsics") from error
     return offset
 
 
@@ -312,7 +317,7 @@ def _row(text: str, count: int, where: str) -> np.ndarray:
         values = np.array([float(word) for word in words])
     except ValueError as error:
         raise InputError(f"{where}: {error}: expected {count} numbers") from error
-    if not np.isfinite(values).all():
+    if not (np.abs(values) <= _LARGEST).all():
         raise InputError(f"{where}: not every number is finite")
     return values
 

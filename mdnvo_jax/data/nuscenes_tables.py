@@ -18,7 +18,7 @@ import re
 import sys
 from collections import defaultdict
 from collections.abc import Iterator
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, NamedTuple, TextIO
 
 import numpy as np
@@ -31,6 +31,15 @@ TABLES = ("sensor", "calibrated_sensor", "scene", "sample", "sample_data", "ego_
 # Characters read at once, and how long a row may be: the longest in use has under a thousand.
 _CHUNK = 1 << 20
 _LONGEST_ROW = 1 << 16
+# Fields whose values are text.
+_TEXTS = frozenset(
+    (
+        *("token", "channel", "name", "description", "filename", "scene_token", "sample_token", "sensor_token"),
+        *("ego_pose_token", "calibrated_sensor_token"),
+    )
+)
+# Microseconds since 1970 until the year 2255: those that float64 has exactly.
+_LATEST_US = 1 << 53
 _BETWEEN_ROWS = re.compile(r"[\s,]*")
 # Tables larger than this are announced: reading them takes more than a few seconds.
 _LARGE_BYTES = 200_000_000
@@ -141,6 +150,7 @@ def rows(path: Path, fields: tuple[str, str, *tuple[str, ...]]) -> Iterator[tupl
       InputError: the file is no JSON list of objects that have these fields; the message names the line.
     """
     pick = operator.itemgetter(*fields)
+    texts = [index for index, name in enumerate(fields) if name in _TEXTS]
     decode = json.JSONDecoder().raw_decode
     line = 1
     with path.open(encoding="utf-8") as file:
@@ -165,11 +175,19 @@ def rows(path: Path, fields: tuple[str, str, *tuple[str, ...]]) -> Iterator[tupl
                 line += text.count("\n", 0, at)
                 text, at = text[at:] + more, 0
                 continue
+            except (ValueError, RecursionError) as error:
+                # A number of thousands of digits, or lists in lists in lists.
+                raise _malformed(path, line, text[:at], str(error)) from error
             try:
-                yield pick(row)
+                found = pick(row)
             except (KeyError, TypeError) as error:
                 lacking = [name for name in fields if not isinstance(row, dict) or name not in row]
                 raise _malformed(path, line, text[:at], f"a row without {', '.join(lacking)}") from error
+            for index in texts:
+                if type(found[index]) is not str:
+                    what = f"{fields[index]} {str(found[index])[:40]} is no text"
+                    raise _malformed(path, line, text[:at], what)
+            yield found
             at = end
 
 
@@ -238,8 +256,15 @@ def _images(
         number = numbers.setdefault(ego, len(numbers))
         try:
             found = Image(int(time_us), str(file), bool(is_key_frame), sensor, number, (int(height), int(width)))
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise InputError(f"{path}, token {token}: {error}: expected timestamp, height and width") from error
+        if not 0 <= found.time_us <= _LATEST_US:
+            raise InputError(f"{path}, token {token}: timestamp {found.time_us:.3g}: expected microseconds since 1970")
+        if "\0" in file or ".." in PurePath(file).parts or PurePath(file).is_absolute():
+            # Such a name would lead to files that nobody meant to show.
+            raise InputError(
+                f"{path}, token {token}: filename {file[:80]!r}: expected a path below the data set's root"
+            )
         if token not in by_token:
             by_token[token] = found
             images[scene].append(found)
@@ -261,8 +286,10 @@ def _egos(path: Path, numbers: dict[str, int]) -> np.ndarray:
         pose = _rigid(translation, rotation, where)
         try:
             found = float(time_us), *pose
-        except (TypeError, ValueError) as error:
-            raise InputError(f"{where}: timestamp {time_us}: expected microseconds") from error
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InputError(f"{where}: timestamp {str(time_us)[:40]}: expected microseconds") from error
+        if not 0 <= found[0] <= _LATEST_US:
+            raise InputError(f"{where}: timestamp {found[0]:.3g}: expected microseconds since 1970")
         if not np.isnan(egos[number, 0]) and tuple(egos[number]) != found:
             raise InputError(f"{where}: two rows that differ: expected each token once")
         egos[number] = found
@@ -275,7 +302,7 @@ def _rigid(translation: Any, rotation: Any, where: str) -> Rigid:
         x, y, z = translation
         w, i, j, k = rotation
         values = float(x), float(y), float(z), float(w), float(i), float(j), float(k)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise InputError(f"{where}: expected a translation of 3 numbers and a rotation of 4 (w, x, y, z)") from error
     # A quaternion has length 1 up to the digits of the file; what has not, such as NaN, is no rotation.
     if not (abs(sum(value * value for value in values[3:]) - 1) < 1e-3 and all(map(math.isfinite, values))):
@@ -287,7 +314,7 @@ def _camera(intrinsic: Any, where: str) -> Camera:
     """Return the intrinsics in a 3x3 matrix."""
     try:
         matrix = np.array(intrinsic, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape != (3, 3) or not np.isfinite(matrix).all() or min(matrix[0, 0], matrix[1, 1]) <= 0:
         raise InputError(f"{where}: camera_intrinsic {intrinsic}: expected the 3x3 matrix of a camera")

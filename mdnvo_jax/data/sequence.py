@@ -59,8 +59,11 @@ class Sequence:
             raise InputError(
                 f"sequence {self.name}: {len(self.paths)} paths for {self.count} frames: expected one a frame"
             )
-        if self.camera is not None and not (len(self.camera) == 4 and np.isfinite(self.camera).all()):
-            raise InputError(f"sequence {self.name}: camera {self.camera}: expected the four numbers fx, fy, cx, cy")
+        camera = self.camera
+        if camera is not None and not (len(camera) == 4 and np.isfinite(camera).all() and min(camera[:2]) > 0):
+            raise InputError(
+                f"sequence {self.name}: camera {camera}: expected the four numbers fx, fy, cx, cy, fx and fy above 0"
+            )
 
     def steps(self, stride: int = 1) -> np.ndarray:
         """Return the labels: step of frame i to i + stride as (tx, ty, tz, rx, ry, rz), `[N - stride, 6]`, m and rad.

@@ -222,5 +222,5 @@ def sequence_past_its_end(path, count):
 def test_a_file_that_is_no_video(tmp_path):
     path = tmp_path / "notes.mp4"
     path.write_text("no video")
-    with pytest.raises(InputError, match=r"notes.mp4 cannot be opened as a video"):
+    with pytest.raises(InputError, match=r"notes.mp4 is no video of a kind that is read"):
         read_frames(path, 1)

@@ -481,11 +481,11 @@ def test_broken_json_is_named(one, text, message):
 @pytest.mark.parametrize("chunk", [1, 2, 7, 100, 4096])
 @pytest.mark.parametrize("indent", [None, 0, 2])
 def test_rows_are_read_whatever_the_chunk(tmp_path, monkeypatch, chunk, indent):
-    expected = [{"token": f"é{i} [{{", "name": [i, {"x": -1.5e-3}], "more": None} for i in range(20)]
+    expected = [{"token": f"é{i} [{{", "rotation": [i, {"x": -1.5e-3}], "more": None} for i in range(20)]
     (tmp_path / "t.json").write_text(json.dumps(expected, indent=indent), encoding="utf-8")
     monkeypatch.setattr(nuscenes_tables, "_CHUNK", chunk)
-    found = list(nuscenes_tables.rows(tmp_path / "t.json", ("token", "name")))
-    assert found == [(row["token"], row["name"]) for row in expected]
+    found = list(nuscenes_tables.rows(tmp_path / "t.json", ("token", "rotation")))
+    assert found == [(row["token"], row["rotation"]) for row in expected]
 
 
 @pytest.mark.parametrize("chunk", [1, 10, 60, 4096])
