@@ -31,7 +31,7 @@ class Trajectory:
       steps: `[N-1, 6]`, the relative poses as (tx, ty, tz, rx, ry, rz).
       step_covariance: `[N-1, 6, 6]`, covariance of those vectors: of a step by itself, whatever its errors come from.
       timestamps: `[N]` s; frame numbers where the source has none.
-      flags: a word a step, empty where nothing is to be said.
+      flags: of each step, words joined by "; ", empty where nothing is to be said; see `watch`.
       mixture: the density of each step, `[N-1, M]` and `[N-1, M, 6]`.
       coupling: how that density combines its dimensions.
       scale_sigma: relative standard deviation of the error of scale that all steps share; see `trajectory`.

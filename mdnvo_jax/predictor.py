@@ -32,6 +32,7 @@ from mdnvo_jax.odometry import Estimate, Trajectory, check_scale_sigma, trajecto
 from mdnvo_jax.streaming import Stream, StreamStep, stream
 from mdnvo_jax.training import checkpoint
 from mdnvo_jax.training.state import Model
+from mdnvo_jax.watch import watched
 
 Mode = Literal["offline", "streaming"]
 # Frames whose results are not waited for while streaming from files.
@@ -267,7 +268,8 @@ def predict(
       progress: wraps the iterator over chunks of frames to show how far it is; told the number of chunks.
 
     Returns:
-      The trajectory; `.save(directory)` writes its files.
+      The trajectory; `.save(directory)` writes its files. Its flags say which steps were held, and what `watch` found
+      of their frames and times.
 
     Raises:
       InputError: the frames are unusable.
@@ -287,6 +289,8 @@ def predict(
     _warm_up(predictor, mode, size, hop)
     seconds: ahead.Seconds = defaultdict(float, start=time.perf_counter() - began)
     chunks = ahead.chunks(sequence, predictor.config.image, size, hold=bad_frames == "hold", seconds=seconds)
+    flags: list[list[str]] = []
+    chunks = watched(chunks, sequence.timestamps, flags)
     if progress is not None:
         chunks = progress(chunks, -(-(sequence.count - 1) // size))
     began = time.perf_counter()
@@ -300,7 +304,7 @@ def predict(
         densities,
         coupling=predictor.config.model.coupling,
         timestamps=sequence.timestamps,
-        flags=["held" if flag else "" for flag in held],
+        flags=["; ".join(["held"] * bool(bad) + words) for bad, words in zip(held, flags, strict=True)],
         estimate=estimate,
         scale_sigma=scale_sigma,
         correlation=predictor.correlation,
