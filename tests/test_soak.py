@@ -1,0 +1,96 @@
+"""The trials of bin/soak in short: they pass, and what they are to find, they find."""
+
+import shutil
+from pathlib import Path
+
+import jax.numpy as jnp
+import pytest
+import small_model
+from small_model import CONFIG, LABELS
+
+from mdnvo_jax import config as configuration
+from mdnvo_jax.errors import exit_code
+from mdnvo_jax.model.network import build
+from mdnvo_jax.soak import __main__ as command
+from mdnvo_jax.soak import damage, kills, stream
+from mdnvo_jax.soak.tally import Tally, as_line, from_line, table
+from mdnvo_jax.training import checkpoint, checksum
+from mdnvo_jax.training.state import initial_state, initial_variables
+
+
+@pytest.fixture(scope="module")
+def workdir(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    workdir = tmp_path_factory.mktemp("soak") / "run"
+    store = checkpoint.Store(workdir, keep_latest=2)
+    state = initial_state(initial_variables(build(CONFIG.image, CONFIG.model), CONFIG), CONFIG, LABELS)
+    for step in (1, 2):
+        state = state._replace(model=small_model.trained(), step=jnp.asarray(step), epoch=jnp.asarray(step))
+        store.save(state, {"next_index": step}, CONFIG, 1.0)
+    store.close()
+    (workdir / "config.json").write_text(configuration.as_json(CONFIG))
+    return workdir
+
+
+def test_damage_is_survived(workdir: Path) -> None:
+    found = damage.run(1.5, 0, workdir)
+    assert found.tried >= 1 and found.lost == []
+
+
+def test_damage_that_goes_unnoticed_is_lost(workdir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def other_step(step: Path, draw: object) -> str:
+        shutil.rmtree(step / "training")
+        shutil.copytree(step.parent / "1" / "training", step / "training")
+        return "the training of another step"
+
+    monkeypatch.setattr(damage, "_damage", other_step)
+    monkeypatch.setattr(checksum, "check_stored", lambda *_: None)
+    found = damage.run(0.01, 1, workdir)
+    assert found.lost == ["the training of another step: step 2 is not what was saved"]
+
+
+def test_a_stream_is_measured_and_its_growth_is_lost(workdir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(stream, "_WARM_UP", 100)
+    found = stream.run(0, 0, workdir)
+    assert (found.tried, found.lost) == (200, [])
+    assert "ms a frame" in found.note and " 0 frames flagged" not in found.note
+    monkeypatch.setattr(stream, "MOST_GROWTH_BYTES", -(1 << 40))
+    assert "memory grew by" in stream.run(0, 0, workdir).lost[0]
+
+
+def test_trainings_that_end_elsewhere_are_lost(workdir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    results = iter([{"rows": "a"}, {"rows": "b"}])
+    monkeypatch.setattr(kills.training, "result", lambda _: next(results))
+    monkeypatch.setattr(kills, "_KILLS", 0)
+
+    class Done:
+        returncode = 0
+
+        def communicate(self, timeout: float) -> tuple[str, str]:
+            return "", ""
+
+    monkeypatch.setattr(kills.training, "start", lambda *_: Done())
+    monkeypatch.setattr(kills.tempfile, "tempdir", str(tmp_path))
+    assert kills._chain(tmp_path, tmp_path, None, {"rows": "b"}, 0) == ([], "ends elsewhere: rows")
+    assert kills._chain(tmp_path, tmp_path, None, {"rows": "b"}, 0) == ([], "")
+
+
+def test_the_table_counts_and_any_loss_is_the_exit_code(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    good, bad = Tally("kills", 7, [], "7 SIGKILL"), Tally("stream", 9, ["memory grew"], "1 ms")
+    assert from_line(as_line(bad)) == bad
+    assert table([good, bad]).splitlines()[2:] == [
+        "| kills | 7 | 7 | 0 | 7 SIGKILL |",
+        "| stream | 9 | 8 | 1 | 1 ms |",
+        "lost, stream: memory grew",
+    ]
+    for tallies, code in (([good], 0), ([good, bad], 1)):
+        monkeypatch.setattr(command, "soak", lambda *_, tallies=tallies: tallies)
+        if code:
+            with pytest.raises(SystemExit) as caught:
+                exit_code(command.main, ["--minutes", "1", "--seed", "3"])
+            assert caught.value.code == code
+        else:
+            assert exit_code(command.main, ["--minutes", "1", "--seed", "3"]) == 0
+        assert capsys.readouterr().out.startswith("seed 3, 1 minutes\n| part | tried | survived | lost |")
+    assert exit_code(command.main, ["--minutes", "0"]) == 2
