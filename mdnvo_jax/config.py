@@ -135,6 +135,8 @@ class TrainingConfig:
     epochs: int = 40
     # Steps in an epoch; 0 means once through the training windows.
     steps_per_epoch: int = 0
+    # "sgd": plain stochastic gradient descent, to compare with.
+    optimiser: Literal["adam", "sgd"] = "adam"
     # Paper: Adam (0.9, 0.999), 1e-3, plateau with patience 8 and factor 0.7.
     learning_rate: float = 1e-3
     beta1: float = 0.9

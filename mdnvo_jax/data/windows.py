@@ -198,7 +198,7 @@ def training_batches(
       config: image, data, and the batch size, which counts the windows of all processes together.
       seed: of order and augmentation, 0 to 2^32 - 1.
       rank: number of this process among `world`. Together the processes see the windows, augmentation included, that
-        one process would see: process r takes every `world`-th window of a batch, beginning with the r-th.
+        one process would see, in the same order: process r takes the r-th of `world` equal parts of a batch.
       world: number of processes.
 
     Raises:
@@ -216,7 +216,7 @@ def training_batches(
     # Whole batches of all processes: else the processes' epochs would differ in length.
     whole = len(windows) // config.training.batch_size * config.training.batch_size
     drawn = grain.MapDataset.source(windows).seed(seed).shuffle()[:whole].random_map(draw)
-    return _iterate(drawn[rank::world], batch, config.data, endless=True)
+    return _iterate(_rows_of(drawn, batch, rank, world), batch, config.data, endless=True)
 
 
 def validation_batches(
@@ -225,7 +225,7 @@ def validation_batches(
     """Return batches that hold every validation step once, in order, not augmented.
 
     They are of the form that `training_batches` gives; the last one is filled up with windows whose mask is False
-    throughout. With `world` processes, each sees every `world`-th window and as many batches as the others.
+    throughout. With `world` processes, each sees its part of every batch, as `training_batches` says.
 
     Raises:
       InputError: no poses, no step, or a batch size that `world` does not divide.
@@ -241,8 +241,7 @@ def validation_batches(
         frames, _ = _frames(sequences[window.sequence], indices, config.image)
         return _Example(frames, labels[window.sequence, window.stride][indices[:-1]])
 
-    examples = grain.MapDataset.source(windows).map(read)[rank::world]
-    return _iterate(examples, batch, config.data)
+    return _iterate(_rows_of(grain.MapDataset.source(windows).map(read), batch, rank, world), batch, config.data)
 
 
 def _training_window(
@@ -323,6 +322,14 @@ def _share(config: Config, world: int) -> int:
             "expected a multiple of their number"
         )
     return config.training.batch_size // world
+
+
+def _rows_of(examples: grain.MapDataset, batch: int, rank: int, world: int) -> grain.MapDataset:
+    """Return the part of `examples` that process `rank` of `world` sees: of each batch of all, `batch` rows in a run."""
+    if world == 1:
+        return examples
+    # The mixture takes from its parts by turns: row after row of its batch.
+    return grain.MapDataset.mix([examples[rank * batch + row :: world * batch] for row in range(batch)])
 
 
 def _iterate(examples: Any, batch: int, data_config: DataConfig, *, endless: bool = False) -> grain.DatasetIterator:

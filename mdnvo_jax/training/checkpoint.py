@@ -11,7 +11,6 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 import orbax.checkpoint as ocp
-from jax.experimental import multihost_utils
 from orbax.checkpoint import checkpoint_managers
 
 from mdnvo_jax import config as configuration
@@ -19,7 +18,7 @@ from mdnvo_jax import files
 from mdnvo_jax.config import Config
 from mdnvo_jax.errors import InputError
 from mdnvo_jax.model.network import build
-from mdnvo_jax.training import checksum
+from mdnvo_jax.training import checksum, processes
 from mdnvo_jax.training.state import SKIPPED, Model, State, state_template
 
 # Raised when what is stored, or its meaning, changes. Version 1 has no checksums and does not count skipped steps.
@@ -61,7 +60,7 @@ class Store:
             best_mode="min",
             cleanup_tmp_directories=True,
         )
-        recover(workdir)
+        processes.by_leader(lambda: recover(workdir))
         self._workdir = workdir.absolute()
         self._manager = ocp.CheckpointManager(self._workdir / FOLDER, options=options)
 
@@ -102,11 +101,12 @@ class Store:
         assert saved, f"step {step} was not saved: {self.steps()} are there"
         if replaces:
             self.wait()
-            recover(self._workdir)
+            processes.by_leader(lambda: recover(self._workdir))
 
     def steps(self) -> list[int]:
         """Return the steps that have a checkpoint, newest first."""
-        return sorted(self._manager.all_steps(read=True), reverse=True)
+        self._manager.reload()
+        return sorted(self._manager.all_steps(), reverse=True)
 
     def restore(self, template: State) -> Restored:
         """Return the newest checkpoint that is whole; newer ones are moved to `DAMAGED`, with a warning.
@@ -119,36 +119,49 @@ class Store:
         """
         damaged: dict[int, str] = {}
         for step in self.steps():
+            about, wrong = None, ""
             try:
-                restored = self._restore(step, template)
+                about = self._check(step)
             except InputError:
                 raise
+            except _DAMAGE as error:
+                wrong = _first(error)
+            if not processes.all_agree(not wrong) or about is None:
+                damaged[step] = wrong or "another process cannot read it"
+                continue
+            try:
+                restored = self._restore(step, about, template)
             except _DAMAGE as error:
                 damaged[step] = _first(error)
                 continue
             for number, why in damaged.items():
                 # Out of the way: a step is saved once, and this training will come to it again.
                 place = self._move(number, DAMAGED)
-                print(
-                    f"warning: checkpoint {number} cannot be read and is now {place}; "
-                    f"going on from step {step} ({why})",
-                    file=sys.stderr,
-                )
+                if processes.leads():
+                    print(
+                        f"warning: checkpoint {number} cannot be read and is now {place}; "
+                        f"going on from step {step} ({why})",
+                        file=sys.stderr,
+                    )
             return restored
         raise InputError(
             f"none of the {len(damaged)} checkpoints in {self._manager.directory} can be read "
             f"({'; '.join(f'{step}: {why}' for step, why in damaged.items())}): start again in another --workdir"
         )
 
-    def _restore(self, step: int, template: State) -> Restored:
-        """Return the checkpoint of one step."""
+    def _check(self, step: int) -> dict[str, Any]:
+        """Return what a checkpoint says about itself, after a look at every array of it; raise what is wrong."""
         folder = Path(self._manager.directory) / str(step)
         about = _read_about(folder)
+        for item in ("model", "training"):
+            checksum.check_stored(folder / item, about.get("checksums", {}).get(item))
+        return about
+
+    def _restore(self, step: int, about: dict[str, Any], template: State) -> Restored:
+        """Return the checkpoint of one step; all processes read it together."""
         training = _without_model(template)
         if about["version"] == 1:
             training["sums"] = {name: leaf for name, leaf in training["sums"].items() if name != SKIPPED}
-        for item in ("model", "training"):
-            checksum.check_stored(folder / item, about.get("checksums", {}).get(item))
         found = self._manager.restore(
             step,
             args=ocp.args.Composite(
@@ -167,13 +180,15 @@ class Store:
     def _move(self, step: int, name: str) -> Path:
         """Move a step's folder into the folder `name` beside the checkpoints, and return where it is now."""
         place = self._workdir / name / str(step)
-        if jax.process_index() == 0:
+
+        def move() -> None:
+            nonlocal place
             place.parent.mkdir(exist_ok=True)
             while place.exists():
                 place = place.with_name(f"{place.name}+")
             (self._workdir / FOLDER / str(step)).rename(place)
-        if jax.process_count() > 1:
-            multihost_utils.sync_global_devices(f"moved checkpoint {step}")
+
+        processes.by_leader(move)
         self._manager.reload()
         return place
 

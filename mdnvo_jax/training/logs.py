@@ -24,12 +24,18 @@ CSV = "metrics.csv"
 
 
 class Logs:
-    """The logs of one training, in its workdir; rows after `step` from an earlier run are dropped."""
+    """The logs of one training, in its workdir; rows after `step` from an earlier run are dropped.
 
-    def __init__(self, workdir: Path, step: int) -> None:
+    Of several processes one writes.
+    """
+
+    def __init__(self, workdir: Path, step: int, *, writes: bool = True) -> None:
         self._csv = workdir / CSV
-        self._rows = [row for row in read_rows(self._csv) if int(row["step"]) <= step]
-        self._events = SummaryWriter(str(workdir / "tensorboard"), purge_step=step + 1, flush_secs=10)
+        self._writes = writes
+        self._rows = [row for row in read_rows(self._csv) if int(row["step"]) <= step] if writes else []
+        self._events = SummaryWriter(
+            str(workdir / "tensorboard"), purge_step=step + 1, flush_secs=10, write_to_disk=writes
+        )
 
     def scalars(self, step: int, values: dict[str, float]) -> None:
         """Write scalars to TensorBoard."""
@@ -38,6 +44,8 @@ class Logs:
 
     def epoch(self, row: dict[str, float]) -> None:
         """Add a row to metrics.csv, which is rewritten whole, and its values to TensorBoard."""
+        if not self._writes:
+            return
         self._rows.append({name: _number(value) for name, value in row.items()})
         text = io.StringIO()
         # Rows of an older release may have fewer columns.
@@ -124,7 +132,7 @@ class EpochProgress:
             rich.progress.TimeRemainingColumn(),
             "{task.fields[note]}",
             console=console,
-            disable=not console.is_terminal,
+            disable=not (console.is_terminal and jax.process_index() == 0),
         )
         self._task = self._bar.add_task(title, total=total, completed=start, rate="", note="")
 

@@ -21,7 +21,7 @@ from mdnvo_jax.data.windows import batches_per_epoch, training_batches, validati
 from mdnvo_jax.errors import InputError
 from mdnvo_jax.model.head import Labels
 from mdnvo_jax.model.network import Network, build
-from mdnvo_jax.training import checkpoint, initial, logs, parallel, step
+from mdnvo_jax.training import checkpoint, initial, logs, parallel, processes, step
 from mdnvo_jax.training.state import (
     SKIPPED,
     TRAIN_METRICS,
@@ -91,7 +91,7 @@ def train(config: Config, workdir: Path, *, resume: bool = False) -> str:
     _check_loss(config)
     if not resume:
         initial.check(config)
-    _claim(workdir, resume)
+    processes.by_leader(lambda: _claim(workdir, resume))
     train_set, validation_set, image = load_split(config)
     config = dataclasses.replace(config, image=image)
     if resume:
@@ -110,10 +110,11 @@ def train(config: Config, workdir: Path, *, resume: bool = False) -> str:
     else:
         variables, labels = initial.start(network, config, train_set)
         state = jax.device_put(initial_state(variables, config, labels), everywhere)
-        _describe(workdir, config, labels)
+        processes.by_leader(lambda: _describe(workdir, config, labels))
     run = _Run(config, workdir, network, mesh, store, steps_per_epoch, int(state.step))
     try:
-        return run.epochs(state, batches, lambda: validation_batches(validation_set, config, **share))
+        with processes.together():
+            return run.epochs(state, batches, lambda: validation_batches(validation_set, config, **share))
     finally:
         store.close()
         run.logs.close()
@@ -137,6 +138,8 @@ def _check_loss(config: Config) -> None:
     training = config.training
     if training.schedule == "cosine" and not training.steps_per_epoch:
         raise InputError("training.schedule cosine needs to know how long it is: set training.steps_per_epoch")
+    if training.optimiser == "sgd" and training.weight_decay:
+        raise InputError(f"training.weight_decay {training.weight_decay} is for Adam: leave it at 0 with sgd")
     if training.beta and (training.reduction != "mean" or config.model.head != "mixture"):
         raise InputError(
             f"training.beta {training.beta} with training.reduction {training.reduction} and model.head "
@@ -181,7 +184,7 @@ class _Run:
     ) -> None:
         self.config, self.workdir, self.mesh, self.store = config, workdir, mesh, store
         self.steps_per_epoch = steps_per_epoch
-        self.logs = logs.Logs(workdir, first_step)
+        self.logs = logs.Logs(workdir, first_step, writes=processes.leads())
         self.first_step = first_step
         self.train_step = parallel.compile_step(step.bind(step.train_step, network, config), mesh, donate=True)
         self.validation_step = parallel.compile_step(
@@ -195,19 +198,22 @@ class _Run:
         best = min((float(row["validation_loss"]) for row in logs.read_rows(self.workdir / logs.CSV)), default=math.inf)
         with StopRequest().listening() as stop:
             for epoch in range(int(state.epoch), self.config.training.epochs):
-                state = self.steps(state, batches, epoch, stop)
-                if stop.signal:
+                state, stopped = self.steps(state, batches, epoch, stop)
+                if stopped:
                     self.store.save(state, batches.get_state(), self.config)
                     self.store.wait()
-                    message = f"stopped by {stop.signal.name} after step {int(state.step)}; go on with --resume"
-                    raise Stopped(message, stop.signal)
+                    # Of several processes, one that was not asked stops with the one that was.
+                    number = stop.signal or signal.SIGTERM
+                    message = f"stopped by {number.name} after step {int(state.step)}; go on with --resume"
+                    raise Stopped(message, number)
                 state, row = self.validate(state, validation(), epoch)
                 # A row of a step that no checkpoint has is dropped by whoever resumes; the other way round it would
                 # be missing for good.
                 self.logs.epoch(row)
                 self.store.save(state, batches.get_state(), self.config, row["validation_loss"])
                 best = min(best, row["validation_loss"])
-                print(_epoch_line(row), flush=True)
+                if processes.leads():
+                    print(_epoch_line(row), flush=True)
         self.store.wait()
         steps = int(state.step) - self.first_step
         seconds = time.monotonic() - started
@@ -217,13 +223,16 @@ class _Run:
             f"best validation loss {best:.4f}; everything is in {self.workdir}"
         )
 
-    def steps(self, state: State, batches: Any, epoch: int, stop: StopRequest) -> State:
-        """Run the rest of an epoch, or to a signal."""
+    def steps(self, state: State, batches: Any, epoch: int, stop: StopRequest) -> tuple[State, bool]:
+        """Run the rest of an epoch, or to a signal, in whichever process; return whether there was one."""
         start = int(state.step) - epoch * self.steps_per_epoch
         title = f"epoch {epoch + 1}/{self.config.training.epochs}"
         pending: dict[str, jax.Array] | None = None
+        stopped = False
         with logs.EpochProgress(title, self.steps_per_epoch, start) as progress:
             for index in range(start, self.steps_per_epoch):
+                # Before the step, so that all processes know of it while the step runs, and stop after the same one.
+                asked = parallel.anywhere(stop.signal is not None, self.mesh)
                 batch = parallel.place(next(batches), self.mesh)
                 state, metrics = self.train_step(state, batch)
                 # The step before is looked at while this one runs, so that the device never waits for us.
@@ -231,12 +240,12 @@ class _Run:
                     self.inspect(pending, epoch * self.steps_per_epoch + index)
                     progress.advance(float(pending["loss"]))
                 pending = metrics
-                if stop.signal:
+                if stopped := bool(asked):
                     break
             if pending is not None:
                 self.inspect(pending, int(state.step))
                 progress.advance(float(pending["loss"]))
-        return state
+        return state, stopped
 
     def inspect(self, metrics: dict[str, jax.Array], number: int) -> None:
         """Stop at values that are not finite, or count them; write every few steps' metrics to TensorBoard."""

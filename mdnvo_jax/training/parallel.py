@@ -15,6 +15,8 @@ from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
 from mdnvo_jax.errors import InputError
 
+_any = jax.jit(jax.numpy.any)
+
 
 def make_mesh(batch_size: int, devices: int | None = None) -> Mesh:
     """Return a mesh with one axis `data` over `devices` devices, or over all.
@@ -54,6 +56,14 @@ def compile_step(function: Callable[..., Any], mesh: Mesh, *, donate: bool) -> C
         out_shardings=replicated(mesh),
         donate_argnums=(0,) if donate else (),
     )
+
+
+def anywhere(here: bool, mesh: Mesh) -> bool | jax.Array:
+    """Return whether `here` is true in any process; of several, as an array that is computed in turn with the steps."""
+    if jax.process_count() == 1:
+        return here
+    rows = np.full(len(mesh.local_devices), here)
+    return _any(jax.make_array_from_process_local_data(split(mesh), rows))
 
 
 def place(batch: dict[str, np.ndarray], mesh: Mesh) -> dict[str, jax.Array]:

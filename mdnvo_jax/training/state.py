@@ -66,13 +66,16 @@ SKIPPED = "skipped"
 
 
 def make_optimiser(config: TrainingConfig) -> optax.GradientTransformation:
-    """Return Adam or AdamW with clipping by the global norm; the schedule's scale is applied by the step."""
-    if config.weight_decay:
-        adam = optax.adamw(config.learning_rate, b1=config.beta1, b2=config.beta2, weight_decay=config.weight_decay)
+    """Return Adam, AdamW or SGD with clipping by the global norm; the schedule's scale is applied by the step."""
+    rate, betas = config.learning_rate, {"b1": config.beta1, "b2": config.beta2}
+    if config.optimiser == "sgd":
+        update = optax.sgd(rate)
+    elif config.weight_decay:
+        update = optax.adamw(rate, weight_decay=config.weight_decay, **betas)
     else:
         # Not the same with a decay of 0: its state has another structure.
-        adam = optax.adam(config.learning_rate, b1=config.beta1, b2=config.beta2)
-    return optax.chain(optax.clip_by_global_norm(config.gradient_clip), adam) if config.gradient_clip else adam
+        update = optax.adam(rate, **betas)
+    return optax.chain(optax.clip_by_global_norm(config.gradient_clip), update) if config.gradient_clip else update
 
 
 def make_plateau(config: TrainingConfig) -> optax.GradientTransformationExtraArgs:

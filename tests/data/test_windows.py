@@ -118,8 +118,7 @@ def test_validation_is_shared_among_processes(toy):
     whole = [numbers(batch) for batch in windows.validation_batches(sequences, config)]
     shares = [[numbers(b) for b in windows.validation_batches(sequences, config, rank=r, world=2)] for r in range(2)]
     for one, first, second in zip(whole, *shares, strict=True):
-        np.testing.assert_array_equal(one[0::2], first)
-        np.testing.assert_array_equal(one[1::2], second)
+        np.testing.assert_array_equal(np.concatenate([first, second]), one)
 
 
 def test_split_shares_no_frame(toy):
@@ -279,10 +278,25 @@ def test_processes_share_the_batches_of_one(toy):
     shares = [taken(windows.training_batches(sequences, config, seed=2, rank=r, world=3), 12) for r in range(3)]
     for batch, *parts in zip(whole, *shares, strict=True):
         for key, values in batch.items():
-            for rank, part in enumerate(parts):
-                np.testing.assert_array_equal(part[key], values[rank::3])
+            np.testing.assert_array_equal(np.concatenate([part[key] for part in parts]), values)
     with pytest.raises(InputError, match=r"batch_size 6 is not divisible among 4 processes"):
         windows.training_batches(sequences, config, seed=2, rank=0, world=4)
+
+
+@pytest.mark.parametrize(("before", "after"), [(1, 2), (2, 1), (3, 2)])
+def test_other_processes_go_on_where_some_stopped(toy, before, after):
+    sequences, config = [toy(23)], config_of(batch_size=6, **BUSY)
+    whole = taken(windows.training_batches(sequences, config, seed=2), 9)
+    stopped = windows.training_batches(sequences, config, seed=2, rank=0, world=before)
+    taken(stopped, 5)
+    parts = []
+    for rank in range(after):
+        share = windows.training_batches(sequences, config, seed=2, rank=rank, world=after)
+        share.set_state(stopped.get_state())
+        parts.append(taken(share, 4))
+    for one, *rows in zip(whole[5:], *parts, strict=True):
+        for key, values in one.items():
+            np.testing.assert_array_equal(np.concatenate([row[key] for row in rows]), values)
 
 
 def test_mistakes_are_named(toy):
