@@ -44,6 +44,12 @@ class ModelConfig:
     # "float32", or "mixed": factors of the convolutions' products rounded to bfloat16, summed in float32, on GPU, TPU
     # and processors with AMX. Not given in the paper.
     products: Literal["float32", "mixed"] = "float32"
+    # Type of the maps between the convolutions while training. "bfloat16" halves their memory; parameters, statistics,
+    # the LSTM and the density stay float32. Not given in the paper.
+    activations: Literal["float32", "bfloat16"] = "float32"
+    # Compute the maps of the convolutions a second time in the backward pass instead of keeping them: less memory, a
+    # third more time.
+    rematerialise: bool = False
     # Paper: dropout 0.1 on the convolutions.
     conv_dropout: float = 0.1
     # Share of the running statistics of BatchNorm that a batch leaves. torch's default; with few windows a batch 0.99
@@ -131,6 +137,9 @@ class TrainingConfig:
 
     seed: int = 0
     batch_size: int = 8
+    # Parts that a batch is taken in, one after another, to save memory: one step with the mean of their gradients.
+    # BatchNorm normalises each part by itself.
+    accumulate: int = 1
     # Paper: about 40 epochs.
     epochs: int = 40
     # Steps in an epoch; 0 means once through the training windows.

@@ -37,12 +37,20 @@ def main(arguments: Sequence[str]) -> None:
 
 def _add_processes(parser: Parser) -> None:
     """Add the options by which a process finds those that train with it; see `mdnvo_jax.training.processes`."""
-    add = parser.add_argument_group("several processes, on one host or many, each started with this command").add_argument
+    add = parser.add_argument_group(
+        "several processes, on one host or many, each started with this command"
+    ).add_argument
     add("--cluster", action="store_true", help="let JAX find them: Slurm, Open MPI, Cloud TPU, GKE")
     add("--coordinator", metavar="HOST:PORT", help="where process 0 listens; with the next two")
     add("--processes", type=int, metavar="N", help="how many there are")
     add("--process", type=int, metavar="I", help="the number of this one, from 0")
-    add("--lost-after", type=int, default=100, metavar="S", help="seconds of silence that mean one is gone [%(default)s]")
+    add(
+        "--lost-after",
+        type=int,
+        default=100,
+        metavar="S",
+        help="seconds of silence that mean one is gone [%(default)s]",
+    )
 
 
 if __name__ == "__main__":

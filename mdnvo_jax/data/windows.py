@@ -325,7 +325,7 @@ def _share(config: Config, world: int) -> int:
 
 
 def _rows_of(examples: grain.MapDataset, batch: int, rank: int, world: int) -> grain.MapDataset:
-    """Return the part of `examples` that process `rank` of `world` sees: of each batch of all, `batch` rows in a run."""
+    """Return the part of `examples` that process `rank` of `world` sees: `batch` rows in a run of each whole batch."""
     if world == 1:
         return examples
     # The mixture takes from its parts by turns: row after row of its batch.

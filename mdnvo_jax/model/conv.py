@@ -70,14 +70,22 @@ class Moments(NamedTuple):
     pixels: Array
 
 
-def batch_moments(x: Array, mask: Array) -> Moments:
-    """Return the moments of maps `x` `[N, H, W, C]` over those with a true `mask` `[N]`; zeros where there are none."""
+def batch_moments(x: Array, mask: Array, axis_name: str | None = None) -> Moments:
+    """Return the moments of maps `x` `[N, H, W, C]` over those with a true `mask` `[N]`; zeros where there are none.
+
+    They are those of the maps of all devices along the axis `axis_name` of a `jax.pmap`, where one is named.
+    """
+
+    def total(values: Array) -> Array:
+        return values if axis_name is None else jax.lax.psum(values, axis_name)
+
+    x = x.astype(jnp.promote_types(x.dtype, jnp.float32))
     where = mask[:, None, None, None]
-    pixels = mask.sum() * (x.shape[1] * x.shape[2])
+    pixels = total(mask.sum() * (x.shape[1] * x.shape[2]))
     divisor = jnp.maximum(pixels, 1).astype(x.dtype)
-    mean = jnp.sum(x, axis=(0, 1, 2), where=where) / divisor
+    mean = total(jnp.sum(x, axis=(0, 1, 2), where=where)) / divisor
     # Two passes: the mean of squares minus the square of the mean loses digits where the mean is large.
-    variance = jnp.sum(jnp.square(x - mean), axis=(0, 1, 2), where=where) / divisor
+    variance = total(jnp.sum(jnp.square(x - mean), axis=(0, 1, 2), where=where)) / divisor
     return Moments(mean, variance, pixels)
 
 
@@ -88,7 +96,8 @@ class ConvBlock(nn.Module):
     the unbiased one. (`flax.linen.BatchNorm` keeps the biased one, and its statistics are NaN for a batch whose maps
     are all masked; here such a batch is normalised with the running statistics, and leaves them alone.)
 
-    Parameters are kernel `[k, k, C, D]`, scale `[D]` and bias `[D]`; batch statistics are mean `[D]` and var `[D]`.
+    Parameters are kernel `[k, k, C, D]`, scale `[D]` and bias `[D]`; batch statistics are mean `[D]` and var `[D]`. All
+    of them, and what is computed between two convolutions, are float32; the maps come and go in their own type.
     """
 
     layer: Layer
@@ -96,9 +105,10 @@ class ConvBlock(nn.Module):
     dropout: float
     products: Products = "float32"
     momentum: float = 0.9
+    axis_name: str | None = None
 
     @nn.compact
-    def __call__(self, x: Array, mask: Array, *, train: bool) -> Array:
+    def __call__(self, x: Array, mask: Array, train: bool) -> Array:
         """Return `[N, h, w, channels]` for maps `[N, H, W, C]`; `mask` `[N]` marks those that count in statistics."""
         size = self.layer.kernel
         kernel = self.param("kernel", nn.initializers.glorot_uniform(), (size, size, x.shape[-1], self.channels))
@@ -107,10 +117,11 @@ class ConvBlock(nn.Module):
         running_mean = self.variable("batch_stats", "mean", jnp.zeros, (self.channels,))
         running_variance = self.variable("batch_stats", "var", jnp.ones, (self.channels,))
 
+        kind = x.dtype
         x = convolve(x, kernel, self.layer.stride, self.layer.padding, self.products)
         mean, variance = running_mean.value, running_variance.value
         if train:
-            batch = batch_moments(x, mask)
+            batch = batch_moments(x, mask, self.axis_name)
             filled = batch.pixels > 0
             unbiased = batch.variance * (batch.pixels / jnp.maximum(batch.pixels - 1, 1))
             running_mean.value = jnp.where(filled, self._blend(mean, batch.mean), mean)
@@ -119,7 +130,8 @@ class ConvBlock(nn.Module):
             variance = jnp.where(filled, batch.variance, variance)
         x = (x - mean) * (scale * jax.lax.rsqrt(variance + BATCH_NORM_EPSILON)) + bias
         x = nn.leaky_relu(x, LEAKY_SLOPE)
-        return drop(x, self.dropout, self.make_rng("dropout")) if train and self.dropout else x
+        x = drop(x, self.dropout, self.make_rng("dropout")) if train and self.dropout else x
+        return x.astype(kind)
 
     def _blend(self, running: Array, batch: Array) -> Array:
         """Return the running statistic after one more batch."""
@@ -127,12 +139,25 @@ class ConvBlock(nn.Module):
 
 
 class ConvStack(nn.Module):
-    """The nine blocks of `LAYERS`, with channels scaled by `multiplier` and dropout of rate `dropout` after each."""
+    """The nine blocks of `LAYERS`, with channels scaled by `multiplier` and dropout of rate `dropout` after each.
+
+    Attributes:
+      multiplier: of the channels.
+      dropout: its rate.
+      products: see `convolution`.
+      momentum: of the running statistics.
+      activations: type of the maps while training.
+      rematerialise: whether the backward pass computes the maps again.
+      axis_name: of the `jax.pmap` whose devices share the batch, if it is one.
+    """
 
     multiplier: float
     dropout: float
     products: Products = "float32"
     momentum: float = 0.9
+    activations: str = "float32"
+    rematerialise: bool = False
+    axis_name: str | None = None
 
     def __call__(self, pairs: Array, mask: Array, *, train: bool) -> Array:
         """Return the last of `maps`: `[N, h, w, D]` with h, w of `map_size` and D = 1024 * multiplier."""
@@ -148,12 +173,14 @@ class ConvStack(nn.Module):
           train: whether to drop units, normalise with the batch and update the collection "batch_stats".
 
         Returns:
-          Nine times `[N, h, w, D]`.
+          Nine times `[N, h, w, D]`, float32.
         """
+        block_type = nn.remat(ConvBlock, static_argnums=(3,)) if self.rematerialise and train else ConvBlock
+        x = pairs.astype(self.activations) if train else pairs
         maps = []
         for layer in LAYERS:
             channels = layer_channels(layer, self.multiplier)
-            block = ConvBlock(layer, channels, self.dropout, self.products, self.momentum, name=layer.name)
-            pairs = block(pairs, mask, train=train)
-            maps.append(pairs)
-        return tuple(maps)
+            shared = (self.products, self.momentum, self.axis_name)
+            x = block_type(layer, channels, self.dropout, *shared, name=layer.name)(x, mask, train)
+            maps.append(x)
+        return tuple(x.astype(pairs.dtype) for x in maps)

@@ -40,7 +40,7 @@ def convolve(x: Array, kernel: Array, stride: int, padding: int, products: Produ
 
     Args:
       x: maps `[N, H, W, C]`.
-      kernel: weights `[k, k, C, D]`.
+      kernel: weights `[k, k, C, D]`, of the type of `x` or a finer one, which is that of its gradient.
       stride: step in pixels, the same in both directions.
       padding: zeros added on each of the four sides.
       products: "float32" or "mixed", see above.
@@ -81,8 +81,9 @@ def _backward(
 
     def cpu(x: Array, kernel: Array, g: Array) -> tuple[Array, Array]:
         kind = jnp.bfloat16 if products == "mixed" and has_matrix_units() else x.dtype
-        input_gradient = _input_gradient(g, kernel, x.shape, stride, padding)
-        return input_gradient, _kernel_gradient(g, x, kernel.shape, stride, padding, kind)
+        input_gradient = _input_gradient(g, kernel.astype(x.dtype), x.shape, stride, padding)
+        kernel_gradient = _kernel_gradient(g, x, kernel.shape, stride, padding, kind)
+        return input_gradient, kernel_gradient.astype(kernel.dtype)
 
     def elsewhere(x: Array, kernel: Array, g: Array) -> tuple[Array, Array]:
         kind = jnp.bfloat16 if products == "mixed" else x.dtype
@@ -153,7 +154,7 @@ def _kernel_gradient(g: Array, x: Array, shape: tuple[int, ...], stride: int, pa
     after = height * stride - x.shape[1] - padding, width * stride - x.shape[2] - padding
     # bfloat16 moves as whole numbers: XLA's CPU backend slices and joins it by way of float32.
     carrier = jnp.uint16 if kind == jnp.bfloat16 else kind
-    total = jnp.zeros((size * size * channels, outputs), x.dtype)
+    total = jnp.zeros((size * size * channels, outputs), jnp.promote_types(x.dtype, jnp.float32))
     x, g = (lax.bitcast_convert_type(array.astype(kind), carrier) for array in (x, g))
     x = lax.pad(x, jnp.zeros((), carrier), ((0, 0, 0), (padding, after[0], 0), (padding, after[1], 0), (0, 0, 0)))
     phases = x.reshape(images, height, stride, width, stride, channels).transpose(0, 2, 4, 5, 1, 3)

@@ -18,18 +18,29 @@ Variables = dict[str, Any]
 
 
 class Network(nn.Module):
-    """The whole network, in float32. Parameters: `stack` (`conv.ConvStack`), `lstm` (`bilstm.init_lstm`), `head`.
+    """The whole network, in float32 but for `ModelConfig.activations`.
 
-    It is what is trained; prediction runs the same function in parts, see `fold`.
+    Its parameters are `stack` (`conv.ConvStack`), `lstm` (`bilstm.init_lstm`), and `head`. It is what is trained;
+    prediction runs the same function in parts, see `fold`. Inside a `jax.pmap` over parts of a batch, `axis_name` is
+    that of its axis: batch normalisation then sees the whole batch.
     """
 
     image_config: ImageConfig
     model_config: ModelConfig
+    axis_name: str | None = None
 
     def setup(self) -> None:
         """Declare the three parts."""
         config = self.model_config
-        self.stack = ConvStack(config.width, config.conv_dropout, config.products, config.batch_norm_momentum)
+        self.stack = ConvStack(
+            config.width,
+            config.conv_dropout,
+            config.products,
+            config.batch_norm_momentum,
+            config.activations,
+            config.rematerialise,
+            self.axis_name,
+        )
         self.lstm: LstmParams = self.param(
             "lstm",
             functools.partial(
@@ -84,9 +95,9 @@ class Network(nn.Module):
         return outputs, flow.reshape(batch, frames - 1, *flow.shape[1:])
 
 
-def build(image_config: ImageConfig, model_config: ModelConfig) -> Network:
-    """Return the network for images and sizes of a configuration."""
-    return Network(image_config, model_config)
+def build(image_config: ImageConfig, model_config: ModelConfig, axis_name: str | None = None) -> Network:
+    """Return the network for images and sizes of a configuration; for `axis_name` see `Network`."""
+    return Network(image_config, model_config, axis_name)
 
 
 def feature_size(image_config: ImageConfig, model_config: ModelConfig) -> int:

@@ -20,7 +20,15 @@ from mdnvo_jax.training import checkpoint
 from mdnvo_jax.training.state import initial_variables
 
 # Fields of the model that weights do not depend on: how it is trained, and how products are computed.
-_FREE = ("conv_dropout", "batch_norm_momentum", "lstm_dropout", "flow_weight", "products")
+_FREE = (
+    "conv_dropout",
+    "batch_norm_momentum",
+    "lstm_dropout",
+    "flow_weight",
+    "products",
+    "activations",
+    "rematerialise",
+)
 
 
 def check(config: Config) -> None:

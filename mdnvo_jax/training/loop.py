@@ -96,7 +96,7 @@ def train(config: Config, workdir: Path, *, resume: bool = False) -> str:
     config = dataclasses.replace(config, image=image)
     if resume:
         _check_same(config, workdir)
-    mesh = parallel.make_mesh(config.training.batch_size)
+    mesh = parallel.make_mesh(config.training.batch_size, accumulate=config.training.accumulate)
     share = {"rank": jax.process_index(), "world": jax.process_count()}
     batches = training_batches(train_set, config, seed=config.training.seed, **share)
     steps_per_epoch = config.training.steps_per_epoch or batches_per_epoch(train_set, config)

@@ -18,16 +18,17 @@ from mdnvo_jax.errors import InputError
 _any = jax.jit(jax.numpy.any)
 
 
-def make_mesh(batch_size: int, devices: int | None = None) -> Mesh:
+def make_mesh(batch_size: int, devices: int | None = None, *, accumulate: int = 1) -> Mesh:
     """Return a mesh with one axis `data` over `devices` devices, or over all.
 
     Raises:
-      InputError: the devices do not divide the batch.
+      InputError: the devices, and the parts that each takes its share in, do not divide the batch.
     """
     found = jax.devices()[:devices]
-    if batch_size % len(found):
+    if accumulate < 1 or batch_size % (len(found) * accumulate):
+        parts = f", in {accumulate} parts each (training.accumulate)" if accumulate != 1 else ""
         raise InputError(
-            f"training.batch_size is {batch_size}: expected a multiple of the {len(found)} devices that share it"
+            f"training.batch_size is {batch_size}: expected a multiple of the {len(found)} devices that share it{parts}"
         )
     return jax.make_mesh((len(found),), ("data",), axis_types=(AxisType.Auto,), devices=found)
 

@@ -106,8 +106,10 @@ def flow_loss(predicted: jax.Array, flow: jax.Array) -> jax.Array:
     return jnp.sum(length, where=known) / jnp.maximum(known.sum(), 1)
 
 
-def train_step(state: State, batch: Batch, *, network: Network, config: Config) -> tuple[State, Metrics]:
-    """Take one step of Adam on one batch.
+def train_step(
+    state: State, batch: Batch, *, network: Network, config: Config, axis_name: str | None = None
+) -> tuple[State, Metrics]:
+    """Take one step of the optimiser on one batch.
 
     With `training.skip_nonfinite`, a step with a metric that is infinite or not a number changes nothing but two
     counts, of steps and of skipped ones: the next step has another batch, another dropout and the rate of its number.
@@ -117,6 +119,8 @@ def train_step(state: State, batch: Batch, *, network: Network, config: Config) 
       batch: `images` `[B, T+1, H, W, C]` uint8, `steps` `[B, T, 6]`, `mask` `[B, T]`.
       network: the network.
       config: the experiment.
+      axis_name: of the axis of a `jax.pmap` of this function over equal parts of a batch, whose `network` was built
+        with the same name. Not for a batch that is split by its sharding.
 
     Returns:
       The next state, and the metrics `TRAIN_METRICS` of this step, each a scalar; `SKIPPED` counts the steps skipped
@@ -124,20 +128,37 @@ def train_step(state: State, batch: Batch, *, network: Network, config: Config) 
     """
     model = state.model
 
-    def loss_of(params: Any) -> tuple[jax.Array, tuple[jax.Array, Any]]:
+    def loss_of(params: Any, batch_stats: Any, part: Batch, rng: jax.Array) -> tuple[jax.Array, tuple[jax.Array, Any]]:
         (outputs, flow), updated = network.apply(
-            {"params": params, "batch_stats": model.batch_stats},
-            batch["images"],
-            batch["mask"],
+            {"params": params, "batch_stats": batch_stats},
+            part["images"],
+            part["mask"],
             train=True,
-            rngs={"dropout": jax.random.fold_in(state.rng, state.step)},
+            rngs={"dropout": rng},
             mutable=["batch_stats"],
             method="with_flow",
         )
-        loss = training_objective(outputs, flow, batch, model.labels, config)
+        loss = training_objective(outputs, flow, part, model.labels, config)
         return loss, (outputs, updated["batch_stats"])
 
-    (loss, (outputs, batch_stats)), gradient = jax.value_and_grad(loss_of, has_aux=True)(model.params)
+    derive = jax.value_and_grad(loss_of, has_aux=True)
+    rng = jax.random.fold_in(state.rng, state.step)
+    if config.training.accumulate == 1:
+        (loss, (outputs, batch_stats)), gradient = derive(model.params, model.batch_stats, batch, rng)
+    else:
+        batch = _parts(batch, config.training.accumulate)
+
+        def add(carry: tuple[Any, Any], item: tuple[Batch, jax.Array]) -> tuple[Any, tuple[jax.Array, jax.Array]]:
+            part, number = item
+            (loss, (outputs, stats)), gradient = derive(model.params, carry[1], part, jax.random.fold_in(rng, number))
+            return (jax.tree.map(jnp.add, carry[0], gradient), stats), (loss, outputs)
+
+        nothing = jax.tree.map(jnp.zeros_like, model.params)
+        numbers = jnp.arange(config.training.accumulate)
+        (total, batch_stats), (losses, outputs) = jax.lax.scan(add, (nothing, model.batch_stats), (batch, numbers))
+        loss, gradient = losses.mean(), optax.tree.scale(1 / config.training.accumulate, total)
+    if axis_name is not None:
+        loss, gradient = jax.lax.pmean((loss, gradient), axis_name)
     update, optimiser = make_optimiser(config.training).update(gradient, state.optimiser, model.params)
     update = optax.tree.scale(schedule_scale(config.training, state.plateau, state.step), update)
     params = optax.apply_updates(model.params, update)
@@ -155,6 +176,11 @@ def train_step(state: State, batch: Batch, *, network: Network, config: Config) 
         next_state = jax.tree.map(lambda new, old: jnp.where(finite, new, old), next_state, state)
         next_state.sums[SKIPPED] += ~finite
     return next_state._replace(step=state.step + 1), {**metrics, SKIPPED: next_state.sums[SKIPPED]}
+
+
+def _parts(batch: Batch, count: int) -> Batch:
+    """Return a batch as `count` parts on a new first axis, each of every `count`-th row: all devices share in each."""
+    return {name: jnp.moveaxis(rows.reshape(-1, count, *rows.shape[1:]), 1, 0) for name, rows in batch.items()}
 
 
 def _sigma_quantiles(predicted: mixture.Mixture, mask: jax.Array) -> list[jax.Array]:
