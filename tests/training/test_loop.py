@@ -3,6 +3,7 @@
 import csv
 import json
 import signal
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -153,6 +154,56 @@ def test_sigterm_in_the_middle_of_an_epoch_changes_nothing(
     assert_same(tmp_path, uninterrupted)
 
 
+def start_together(config_file: Path, workdir: Path, count: int, *arguments: str) -> list[subprocess.Popen[str]]:
+    """Start `count` processes that train together over loopback."""
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        together = ["--coordinator", f"localhost:{probe.getsockname()[1]}", "--processes", str(count)]
+    return [start(config_file, workdir, *together, "--process", str(rank), *arguments) for rank in range(count)]
+
+
+def test_two_processes_train_as_one_and_any_number_goes_on(
+    config_file: Path, uninterrupted: Path, tmp_path: Path
+) -> None:
+    """Dropout and augmentation included, one of them asked to stop, and the rest done by one process alone."""
+    leader, other = start_together(config_file, tmp_path, 2)
+    assert leader.stdout is not None
+    line = leader.stdout.readline()
+    assert "[Gloo]" in line or line.startswith("epoch   1")
+    if not line.startswith("epoch"):
+        assert leader.stdout.readline().startswith("epoch   1")
+    other.send_signal(signal.SIGTERM)
+    for process in (leader, other):
+        code, out, err = finish(process)
+        assert code == 128 + signal.SIGTERM, err
+        assert "stopped by SIGTERM after step" in out
+    stopped = int(last_state(tmp_path).step)
+    assert 11 < stopped <= 33
+    code, _, err = finish(start(config_file, tmp_path, "--resume"))
+    assert code == 0, err
+    # What differs is the order of sums over the batch, grown by 33 steps of Adam.
+    for row, expected in zip(rows(tmp_path), rows(uninterrupted), strict=True):
+        assert row["step"] == expected["step"]
+        for name in ("loss", "parameter_norm", "sigma_translation_m_q50", "validation_loss"):
+            assert float(row[name]) == pytest.approx(float(expected[name]), rel=2e-4), name
+    assert float(rows(tmp_path)[0]["loss"]) == pytest.approx(float(rows(uninterrupted)[0]["loss"]), rel=1e-6)
+
+
+def test_a_process_that_lost_another_one_ends_and_says_so(config_file: Path, tmp_path: Path) -> None:
+    leader, other = start_together(config_file, tmp_path, 2, "--training.epochs", "300")
+    assert leader.stdout is not None
+    while not leader.stdout.readline().startswith("epoch   1"):
+        assert leader.poll() is None
+    other.kill()
+    code, _, err = finish(leader)
+    assert code == 3
+    assert "error: process 0 lost another process" in err and "--resume" in err
+    assert "Traceback" not in err
+    finish(other)
+    # What was saved before is whole.
+    assert int(last_state(tmp_path).step) >= 11
+
+
 def refusal(capsys: pytest.CaptureFixture[str], *arguments: str) -> str:
     """Run the command in this process, assert that it is refused, return its one line."""
     assert exit_code(train.main, arguments) == 2
@@ -174,6 +225,11 @@ def test_what_cannot_be_done_is_refused_in_one_line(
     assert "no config file" in refusal(capsys, "missing.py", "--workdir", str(tmp_path))
     assert "no sequence" in refusal(capsys, config, "--workdir", str(tmp_path), "--data.train_sequences", "77").lower()
     assert "invalid choice" in refusal(capsys, config, "--workdir", str(tmp_path), "--model.head", "other")
+    alone = ["--workdir", str(tmp_path), "--processes", "2"]
+    assert "--coordinator and --process missing" in refusal(capsys, config, *alone)
+    assert "expected 0 to one less" in refusal(capsys, config, *alone, "--process", "2", "--coordinator", "here:1")
+    assert "--cluster finds the processes by itself" in refusal(capsys, config, *alone, "--cluster")
+    assert "no cluster that JAX knows" in refusal(capsys, config, "--workdir", str(tmp_path), "--cluster")
     assert "expected true or false" in refusal(capsys, config, "--workdir", str(tmp_path), "--image.rectify", "maybe")
     assert (uninterrupted / "checkpoints").stat().st_mtime_ns == before
 

@@ -196,6 +196,38 @@ def test_the_end_of_an_epoch_renews_the_residual_scale_and_forgets_the_sums() ->
     assert int(state.epoch) == 1
 
 
+def full_batch(seed: int = 0) -> step.Batch:
+    """A batch without padding, in which every part of equal size weighs the same."""
+    batch = make_batch(seed)
+    return {**batch, "mask": jnp.ones_like(batch["mask"])}
+
+
+def linear_state(config: Config) -> State:
+    size = mixture.outputs_size(config.model.components)
+    variables = {"params": {"head": jnp.linspace(-0.2, 0.3, size)}, "batch_stats": {"mean": jnp.zeros(())}}
+    return initial_state(variables, config, LABELS)
+
+
+def test_a_batch_in_parts_gives_the_step_of_the_whole() -> None:
+    config = with_(CONFIG, training={"reduction": "mean", "optimiser": "sgd"})
+    found = []
+    for parts in (1, 2, 4):
+        chosen = with_(config, training={"accumulate": parts})
+        train_step = jax.jit(step.bind(step.train_step, Linear(), chosen))
+        found.append(train_step(linear_state(chosen), full_batch()))
+    for state, metrics in found[1:]:
+        np.testing.assert_allclose(state.model.params["head"], found[0][0].model.params["head"], rtol=1e-5)
+        for name in TRAIN_METRICS:
+            np.testing.assert_allclose(metrics[name], found[0][1][name], rtol=1e-5, err_msg=name)
+
+
+def test_plain_gradient_descent_is_the_gradient_times_the_rate() -> None:
+    config = with_(CONFIG, training={"optimiser": "sgd", "gradient_clip": 0.0, "learning_rate": 0.01})
+    after, metrics = jax.jit(step.bind(step.train_step, Linear(), config))(linear_state(config), full_batch())
+    moved = np.linalg.norm(after.model.params["head"] - linear_state(config).model.params["head"])
+    np.testing.assert_allclose(moved, 0.01 * metrics["gradient_norm"], rtol=1e-4)
+
+
 DEVICES_SCRIPT = """
 import sys
 sys.path[:0] = {path!r}
@@ -216,13 +248,26 @@ for seed in range(5):
     batch = parallel.place({{k: np.asarray(v) for k, v in make_batch(seed).items()}}, mesh)
     current, metrics = train_step(current, batch)
     losses.append(float(metrics["loss"]))
+devices = len(batch["images"].sharding.device_set)
 flat = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves((current.model.params, current.model.batch_stats))])
-refused = ""
-try:
-    parallel.make_mesh(3)
-except InputError as error:
-    refused = str(error)
-np.savez(sys.argv[1], refused=refused, losses=losses, flat=flat, devices=len(batch["images"].sharding.device_set))
+refused = []
+for arguments in ({{"batch_size": 3}}, {{"batch_size": 4, "accumulate": 4}}):
+    try:
+        parallel.make_mesh(**arguments)
+        refused.append("")
+    except InputError as error:
+        refused.append(str(error))
+# The same by jax.pmap, as its users would do it.
+count = len(jax.devices())
+mapped = build(config.image, config.model, axis_name="shares")
+pmapped = jax.pmap(lambda s, b: step.train_step(s, b, network=mapped, config=config, axis_name="shares"), "shares")
+spread = jax.tree.map(lambda leaf: jnp.stack([leaf] * count), first_state(config))
+for seed in range(5 if count > 1 else 0):
+    batch = {{k: np.asarray(v).reshape(count, 4 // count, *v.shape[1:]) for k, v in make_batch(seed).items()}}
+    spread, _ = pmapped(spread, batch)
+leaves = jax.tree.leaves((spread.model.params, spread.model.batch_stats))
+by_pmap = np.concatenate([np.ravel(leaf[-1]) for leaf in leaves])
+np.savez(sys.argv[1], refused=refused, losses=losses, flat=flat, by_pmap=by_pmap, devices=devices)
 """
 
 
@@ -236,10 +281,12 @@ def test_two_devices_compute_what_one_computes(tmp_path: Path) -> None:
         subprocess.run([sys.executable, "-c", script, str(result)], env=environment, check=True)
         found.append(np.load(result))
     assert [int(item["devices"]) for item in found] == [1, 2]
-    assert not str(found[0]["refused"])
-    assert "batch_size is 3: expected a multiple of the 2 devices" in str(found[1]["refused"])
+    assert list(found[0]["refused"]) == ["", ""]
+    assert "batch_size is 3: expected a multiple of the 2 devices" in found[1]["refused"][0]
+    assert "that share it, in 4 parts each (training.accumulate)" in found[1]["refused"][1]
     np.testing.assert_allclose(found[1]["losses"], found[0]["losses"], rtol=1e-4)
     np.testing.assert_allclose(found[1]["flat"], found[0]["flat"], rtol=1e-3, atol=1e-5)
+    np.testing.assert_allclose(found[1]["by_pmap"], found[0]["flat"], rtol=1e-3, atol=1e-5)
 
 
 # What training may lower instead of the NLL
