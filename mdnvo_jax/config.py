@@ -175,6 +175,9 @@ class TrainingConfig:
     # Steps of an epoch that may be skipped because the loss, the gradient or another metric is not finite: they leave
     # the network as it is and are counted in metrics.csv. 0: the first such step ends the training.
     skip_nonfinite: int = 0
+    # Where a checkpoint or a log cannot be written, because the disk is full say: "stop" ends the training, "go_on"
+    # says so and tries again with the next one. What was written before stays whole.
+    full_disk: Literal["stop", "go_on"] = "stop"
     # Checkpoints to keep: the newest ones, beside the best.
     keep_latest: int = 2
 

@@ -27,7 +27,7 @@ def main(arguments: Sequence[str]) -> None:
         summary = loop.train(config, Path(options.workdir), resume=options.resume)
         if processes.leads():
             print(summary)
-    except loop.NonFiniteError as error:
+    except (loop.NonFiniteError, loop.DiskError) as error:
         raise InputError(str(error)) from error
     except loop.Stopped as stopped:
         print(stopped)

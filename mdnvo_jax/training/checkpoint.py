@@ -1,10 +1,13 @@
 """Checkpoints: saved while training goes on, the newest and the best kept, read back whole or not at all."""
 
+import contextlib
+import errno
 import json
 import math
 import os
 import shutil
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -31,10 +34,16 @@ _REPLACED = "replaced_checkpoint"
 _METRIC = "validation_loss"
 # What orbax writes into a step's folder last.
 _FINISHED = "_CHECKPOINT_METADATA"
+# What a step's folder is called until it is whole.
+_UNFINISHED = ".orbax-checkpoint-tmp"
 # What orbax calls the one file of a JSON item.
 _JSON_FILE = "metadata"
 # What is raised for a checkpoint that is damaged, incomplete or of another shape depends on where the reader stumbles.
 _DAMAGE = (Exception,)
+
+
+class UnsavedError(OSError):
+    """A checkpoint could not be written; those before it are whole."""
 
 
 class Restored(NamedTuple):
@@ -74,7 +83,11 @@ class Store:
           data_state: the state of the iterator over batches, as JSON values.
           config: the experiment, with the image configuration resolved.
           validation_loss: infinite where this state was not validated, so that it never counts as the best.
+
+        Raises:
+          UnsavedError: the last one could not be written, and this one was not begun; or this one could not be begun.
         """
+        self.wait()
         step = int(state.step)
         replaces = step in self._manager.all_steps()
         if replaces:
@@ -87,16 +100,18 @@ class Store:
             "training": checksum.of_arrays(training),
             "data": checksum.of_json(data),
         }
-        saved = self._manager.save(
-            step,
-            args=ocp.args.Composite(
-                model=ocp.args.StandardSave(state.model),
-                training=ocp.args.StandardSave(training),
-                data=ocp.args.JsonSave(data),
-                about=ocp.args.JsonSave(_about(config, checksums)),
-            ),
-            metrics={_METRIC: validation_loss},
-        )
+        with self._writing():
+            self._check_room(state)
+            saved = self._manager.save(
+                step,
+                args=ocp.args.Composite(
+                    model=ocp.args.StandardSave(state.model),
+                    training=ocp.args.StandardSave(training),
+                    data=ocp.args.JsonSave(data),
+                    about=ocp.args.JsonSave(_about(config, checksums)),
+                ),
+                metrics={_METRIC: validation_loss},
+            )
         # Orbax saves nothing, and says nothing, where it knows of a later step.
         assert saved, f"step {step} was not saved: {self.steps()} are there"
         if replaces:
@@ -193,11 +208,44 @@ class Store:
         return place
 
     def wait(self) -> None:
-        """Return when everything that was saved is on disk."""
-        self._manager.wait_until_finished()
+        """Return when everything that was saved is on disk.
+
+        Raises:
+          UnsavedError: the last checkpoint could not be written.
+        """
+        with self._writing():
+            self._manager.wait_until_finished()
+
+    def _check_room(self, state: State) -> None:
+        """Refuse what the disk has no room for, before orbax tries, and complains in many pages.
+
+        Raises:
+          OSError: there is less room than the arrays take.
+        """
+        needed = sum(leaf.nbytes for leaf in jax.tree.leaves(state))
+        free = shutil.disk_usage(self._workdir).free
+        if jax.process_count() == 1 and free < needed:
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    @contextlib.contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Say in one line what orbax could not write, and remove what it has left of it."""
+        try:
+            yield
+        except (OSError, ValueError) as error:
+            if jax.process_count() == 1:
+                for left in (self._workdir / FOLDER).glob(f"*{_UNFINISHED}*"):
+                    shutil.rmtree(left, ignore_errors=True)
+            steps = self.steps()
+            whole = f"step {steps[0]} is the last whole one" if steps else "there is none yet"
+            full = os.strerror(errno.ENOSPC)
+            reason = full if full in str(error) else _first(error)
+            raise UnsavedError(f"a checkpoint cannot be written to {self._workdir} ({reason}); {whole}") from error
 
     def close(self) -> None:
-        """Finish what is being written and let go."""
+        """Finish what is being written and let go. Whoever wants to know whether it was written waits before."""
+        with contextlib.suppress(UnsavedError):
+            self.wait()
         self._manager.close()
 
 

@@ -1,5 +1,6 @@
 """What a training tells: a progress bar, metrics.csv, TensorBoard events."""
 
+import contextlib
 import csv
 import io
 import math
@@ -8,6 +9,7 @@ import platform
 import shlex
 import subprocess
 import sys
+import time
 from collections.abc import Iterable, Iterator
 from importlib import metadata
 from pathlib import Path
@@ -16,11 +18,14 @@ from typing import Any
 import jax
 import rich.console
 import rich.progress
-from tensorboardX import SummaryWriter
+from tensorboardX.event_file_writer import EventsWriter
+from tensorboardX.proto import event_pb2, summary_pb2
 
 from mdnvo_jax import files
 
 CSV = "metrics.csv"
+# Seconds between two times that TensorBoard's file is brought to the disk.
+_FLUSH_S = 10
 
 
 class Logs:
@@ -33,14 +38,40 @@ class Logs:
         self._csv = workdir / CSV
         self._writes = writes
         self._rows = [row for row in read_rows(self._csv) if int(row["step"]) <= step] if writes else []
-        self._events = SummaryWriter(
-            str(workdir / "tensorboard"), purge_step=step + 1, flush_secs=10, write_to_disk=writes
-        )
+        self._tensorboard = workdir / "tensorboard"
+        self._next_step = step + 1
+        self._events: EventsWriter | None = None
+        self._flushed_s = 0.0
 
     def scalars(self, step: int, values: dict[str, float]) -> None:
-        """Write scalars to TensorBoard."""
-        for name, value in values.items():
-            self._events.add_scalar(name, value, step)
+        """Write scalars to TensorBoard.
+
+        Here and now, not in a thread: one that dies of a full disk would leave the training waiting for it.
+
+        Raises:
+          OSError: they cannot be written; the next ones will be in a new file.
+        """
+        if not self._writes:
+            return
+        try:
+            if self._events is None:
+                self._tensorboard.mkdir(exist_ok=True)
+                self._events = EventsWriter(str(self._tensorboard / "events"))
+                # Steps from here on that an earlier run has written are forgotten.
+                begun = event_pb2.SessionLog(status=event_pb2.SessionLog.START)
+                self._events.write_event(
+                    event_pb2.Event(wall_time=time.time(), step=self._next_step, session_log=begun)
+                )
+            found = [summary_pb2.Summary.Value(tag=name, simple_value=value) for name, value in values.items()]
+            summary = summary_pb2.Summary(value=found)
+            self._events.write_event(event_pb2.Event(wall_time=time.time(), step=step, summary=summary))
+            self._next_step = step + 1
+            if time.monotonic() - self._flushed_s > _FLUSH_S:
+                self._events.flush()
+                self._flushed_s = time.monotonic()
+        except OSError:
+            self._events = None
+            raise
 
     def epoch(self, row: dict[str, float]) -> None:
         """Add a row to metrics.csv, which is rewritten whole, and its values to TensorBoard."""
@@ -58,7 +89,9 @@ class Logs:
 
     def close(self) -> None:
         """Finish the events file."""
-        self._events.close()
+        if self._events is not None:
+            with contextlib.suppress(OSError):
+                self._events.close()
 
 
 def read_rows(path: Path) -> list[dict[str, str]]:

@@ -39,6 +39,10 @@ class NonFiniteError(RuntimeError):
     """The loss or the gradient is infinite or not a number."""
 
 
+class DiskError(RuntimeError):
+    """What belongs to the training cannot be written."""
+
+
 class Stopped(Exception):  # noqa: N818 - no error
     """A signal ended the training in order, everything is saved; `signal_number` says which."""
 
@@ -86,6 +90,7 @@ def train(config: Config, workdir: Path, *, resume: bool = False) -> str:
     Raises:
       InputError: the data, the configuration or the state of `workdir` do not allow it.
       NonFiniteError: the training diverged; the last checkpoint is kept.
+      DiskError: a checkpoint or a log could not be written, and `training.full_disk` says to stop then.
       Stopped: SIGTERM or SIGINT ended it; a checkpoint of the last step is kept.
     """
     _check_loss(config)
@@ -200,8 +205,9 @@ class _Run:
             for epoch in range(int(state.epoch), self.config.training.epochs):
                 state, stopped = self.steps(state, batches, epoch, stop)
                 if stopped:
-                    self.store.save(state, batches.get_state(), self.config)
-                    self.store.wait()
+                    with self.writing():
+                        self.store.save(state, batches.get_state(), self.config)
+                        self.store.wait()
                     # Of several processes, one that was not asked stops with the one that was.
                     number = stop.signal or signal.SIGTERM
                     message = f"stopped by {number.name} after step {int(state.step)}; go on with --resume"
@@ -209,12 +215,20 @@ class _Run:
                 state, row = self.validate(state, validation(), epoch)
                 # A row of a step that no checkpoint has is dropped by whoever resumes; the other way round it would
                 # be missing for good.
-                self.logs.epoch(row)
-                self.store.save(state, batches.get_state(), self.config, row["validation_loss"])
+                with self.writing():
+                    self.logs.epoch(row)
+                # By itself, so that one that could not be written does not keep this one from being tried.
+                with self.writing():
+                    self.store.wait()
+                with self.writing():
+                    self.store.save(state, batches.get_state(), self.config, row["validation_loss"])
                 best = min(best, row["validation_loss"])
                 if processes.leads():
                     print(_epoch_line(row), flush=True)
-        self.store.wait()
+        with self.writing():
+            self.store.wait()
+        if self.store.steps()[:1] != [int(state.step)]:
+            raise DiskError(f"the training is at its end, step {int(state.step)}, which could not be saved")
         steps = int(state.step) - self.first_step
         seconds = time.monotonic() - started
         rate = f"{steps / seconds:.2f} steps/s, validation included" if steps else "nothing was left to do"
@@ -266,7 +280,23 @@ class _Run:
                 f"training.gradient_clip; the last good checkpoint in {self.workdir / checkpoint.FOLDER} is kept"
             )
         if number % _LOG_EVERY == 0:
-            self.logs.scalars(number, {f"step/{name}": float(value) for name, value in metrics.items()})
+            with self.writing():
+                self.logs.scalars(number, {f"step/{name}": float(value) for name, value in metrics.items()})
+
+    @contextlib.contextmanager
+    def writing(self) -> Iterator[None]:
+        """Stop, or say so and go on, where what is done here cannot be written; as `training.full_disk` says.
+
+        Raises:
+          DiskError: it says to stop.
+        """
+        try:
+            yield
+        except OSError as error:
+            what = str(error) if isinstance(error, checkpoint.UnsavedError) else f"a log cannot be written ({error})"
+            if self.config.training.full_disk == "stop":
+                raise DiskError(f"{what}: make room and go on with --resume") from error
+            print(f"warning: {what}: going on, as training.full_disk says", file=sys.stderr, flush=True)
 
     def validate(self, state: State, batches: Any, epoch: int) -> tuple[State, dict[str, float]]:
         """Return the state for the next epoch, and this epoch's row of metrics.csv."""

@@ -2,6 +2,8 @@
 
 import json
 import shutil
+import subprocess
+from collections.abc import Iterator
 from pathlib import Path
 
 import jax
@@ -263,3 +265,47 @@ def test_a_copy_with_another_experiment_keeps_its_checksums(workdir: Path) -> No
     other_parameters(step)
     with pytest.raises(InputError, match="damaged"):
         predictor.load(step)
+
+
+@pytest.fixture
+def small_disk(tmp_path: Path) -> Iterator[Path]:
+    """A file system of its own with room for one checkpoint and a half."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mount = ["mount", "-t", "tmpfs", "-o", "size=1m", "tmpfs", str(place)]
+    if not shutil.which("mount") or subprocess.run(mount, capture_output=True, check=False).returncode:
+        pytest.skip("a small tmpfs cannot be mounted here: that takes Linux and root")
+    yield place
+    subprocess.run(["umount", str(place)], check=True)
+
+
+# Of writes that orbax gave up and nobody waits for.
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
+@pytest.mark.parametrize("looks_first", [True, False])
+def test_a_full_disk_costs_the_checkpoint_that_did_not_fit_and_no_other(
+    small_disk: Path, first_state: State, monkeypatch: pytest.MonkeyPatch, looks_first: bool
+) -> None:
+    def padded(step: int, numbers: int) -> State:
+        filler = jnp.asarray(np.random.default_rng(step).normal(size=numbers), jnp.float32)
+        return initial_state({"params": {"head": filler}, "batch_stats": {}}, CONFIG, LABELS)._replace(
+            step=jnp.asarray(step, jnp.int32)
+        )
+
+    if not looks_first:
+        # As where another program fills the disk in the middle of a save.
+        monkeypatch.setattr(checkpoint.Store, "_check_room", lambda *_: None)
+    store = checkpoint.Store(small_disk, keep_latest=2)
+    store.save(padded(1, 30_000), {}, CONFIG)
+    store.wait()
+    with pytest.raises(checkpoint.UnsavedError, match="No space left on device.*step 1 is the last whole one"):
+        store.save(padded(2, 300_000), {}, CONFIG)
+        store.wait()
+    assert {path.name for path in (small_disk / checkpoint.FOLDER).iterdir()} == {"1"}
+    # What fits is saved again, and both can be read.
+    store.save(padded(3, 1_000), {}, CONFIG)
+    store.close()
+    again = checkpoint.Store(small_disk, keep_latest=2)
+    assert again.steps() == [3, 1]
+    restored = again.restore(checkpoint.abstract(padded(3, 1_000)))
+    again.close()
+    np.testing.assert_array_equal(restored.state.model.params["head"], padded(3, 1_000).model.params["head"])

@@ -293,6 +293,25 @@ def test_skipped_steps_are_in_the_row_of_their_epoch_and_out_of_its_means(tmp_pa
     assert "skipped" not in loop._epoch_line(row | {SKIPPED: 0})
 
 
+def test_what_cannot_be_written_ends_the_training_or_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = idle_run(tmp_path, limit=0)
+    # A file where TensorBoard's folder should be.
+    (tmp_path / "tensorboard").write_text("")
+    run.logs = logs.Logs(tmp_path, 0)
+    with pytest.raises(loop.DiskError, match="a log cannot be written .*make room and go on with --resume"):
+        run.inspect(metrics_of(0), 10)
+    run.config = Config(training=TrainingConfig(full_disk="go_on"))
+    run.inspect(metrics_of(0), 10)
+    assert "going on, as training.full_disk says" in capsys.readouterr().err
+    (tmp_path / "tensorboard").unlink()
+    run.inspect(metrics_of(0), 20)
+    run.logs.close()
+    assert capsys.readouterr().err == ""
+    assert len(list((tmp_path / "tensorboard").iterdir())) == 1
+
+
 def test_rows_of_an_older_release_keep_their_columns(tmp_path: Path) -> None:
     (tmp_path / "metrics.csv").write_text("epoch,step,loss\n1,11,0.5\n")
     written = logs.Logs(tmp_path, 11)
