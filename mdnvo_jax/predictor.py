@@ -19,7 +19,7 @@ from mdnvo_jax import backend as backends
 from mdnvo_jax import offline, recalibration, weights
 from mdnvo_jax.backend import Backend, Precision
 from mdnvo_jax.config import Config, ImageConfig
-from mdnvo_jax.data import ahead, images
+from mdnvo_jax.data import ahead, checks, images
 from mdnvo_jax.data.folder import as_sequence
 from mdnvo_jax.data.sequence import Sequence
 from mdnvo_jax.errors import InputError
@@ -284,6 +284,8 @@ def predict(
     if not 1 <= hop <= window:
         raise InputError(f"hop is {hop}: expected 1 to {window}, the steps in a window")
     _warn_of_uncovered(sequence, predictor.config.image)
+    if line := checks.of_rate(sequence, checks.trained_s(predictor.config.data)):
+        print(f"warning: {line}", file=sys.stderr)
     size = offline.PAIRS if mode == "offline" else 1
     began = time.perf_counter()
     _warm_up(predictor, mode, size, hop)

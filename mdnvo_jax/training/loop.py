@@ -16,6 +16,7 @@ import jax
 from mdnvo_jax import config as configuration
 from mdnvo_jax import files
 from mdnvo_jax.config import Config
+from mdnvo_jax.data import checks
 from mdnvo_jax.data.load import load_split
 from mdnvo_jax.data.windows import batches_per_epoch, training_batches, validation_batches
 from mdnvo_jax.errors import InputError
@@ -98,7 +99,8 @@ def train(config: Config, workdir: Path, *, resume: bool = False) -> str:
         initial.check(config)
     processes.by_leader(lambda: _claim(workdir, resume))
     train_set, validation_set, image = load_split(config)
-    config = dataclasses.replace(config, image=image)
+    interval_s = config.data.interval_s or checks.interval_s(train_set)
+    config = dataclasses.replace(config, image=image, data=dataclasses.replace(config.data, interval_s=interval_s))
     if resume:
         _check_same(config, workdir)
     mesh = parallel.make_mesh(config.training.batch_size, accumulate=config.training.accumulate)
@@ -113,6 +115,9 @@ def train(config: Config, workdir: Path, *, resume: bool = False) -> str:
         state = restored.state
         batches.set_state(restored.data_state)
     else:
+        if processes.leads():
+            for line in checks.of_labels(train_set):
+                print(f"warning: {line}", file=sys.stderr)
         variables, labels = initial.start(network, config, train_set)
         state = jax.device_put(initial_state(variables, config, labels), everywhere)
         processes.by_leader(lambda: _describe(workdir, config, labels))
@@ -153,15 +158,18 @@ def _check_loss(config: Config) -> None:
 
 
 def _check_same(config: Config, workdir: Path) -> None:
-    """Refuse to resume with another configuration than the training began with; only `epochs` may change."""
+    """Refuse to resume with another configuration than the training began with, but for what may change."""
     before = dataclasses.asdict(configuration.from_json((workdir / "config.json").read_text()))
     now = dataclasses.asdict(config)
-    before["training"]["epochs"] = now["training"]["epochs"]
+    for name in ("epochs", "full_disk"):
+        before["training"][name] = now["training"][name]
+    # Older releases did not look at it.
+    before["data"]["interval_s"] = before["data"]["interval_s"] or now["data"]["interval_s"]
     different = [f"{s}.{f}" for s, fields in now.items() for f, value in fields.items() if before[s][f] != value]
     if different:
         raise InputError(
-            f"{', '.join(different)} differ from {workdir / 'config.json'}: "
-            "resume with the same configuration (only training.epochs may change), or train in another --workdir"
+            f"{', '.join(different)} differ from {workdir / 'config.json'}: resume with the same configuration "
+            "(only training.epochs and training.full_disk may change), or train in another --workdir"
         )
 
 

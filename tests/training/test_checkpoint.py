@@ -297,7 +297,7 @@ def test_a_full_disk_costs_the_checkpoint_that_did_not_fit_and_no_other(
     store = checkpoint.Store(small_disk, keep_latest=2)
     store.save(padded(1, 30_000), {}, CONFIG)
     store.wait()
-    with pytest.raises(checkpoint.UnsavedError, match="No space left on device.*step 1 is the last whole one"):
+    with pytest.raises(checkpoint.UnsavedError, match=r"No space left on device.*step 1 is the last whole one"):
         store.save(padded(2, 300_000), {}, CONFIG)
         store.wait()
     assert {path.name for path in (small_disk / checkpoint.FOLDER).iterdir()} == {"1"}

@@ -300,7 +300,7 @@ def test_what_cannot_be_written_ends_the_training_or_is_said(
     # A file where TensorBoard's folder should be.
     (tmp_path / "tensorboard").write_text("")
     run.logs = logs.Logs(tmp_path, 0)
-    with pytest.raises(loop.DiskError, match="a log cannot be written .*make room and go on with --resume"):
+    with pytest.raises(loop.DiskError, match=r"a log cannot be written .*make room and go on with --resume"):
         run.inspect(metrics_of(0), 10)
     run.config = Config(training=TrainingConfig(full_disk="go_on"))
     run.inspect(metrics_of(0), 10)
