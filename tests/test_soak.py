@@ -2,6 +2,7 @@
 
 import gc
 import shutil
+import subprocess
 from pathlib import Path
 
 import jax.numpy as jnp
@@ -13,7 +14,7 @@ from mdnvo_jax import config as configuration
 from mdnvo_jax.errors import exit_code
 from mdnvo_jax.model.network import build
 from mdnvo_jax.soak import __main__ as command
-from mdnvo_jax.soak import damage, kills, stream
+from mdnvo_jax.soak import damage, kills, scale, stream
 from mdnvo_jax.soak.tally import Tally, as_line, from_line, table
 from mdnvo_jax.training import checkpoint, checksum
 from mdnvo_jax.training.state import initial_state, initial_variables
@@ -76,6 +77,51 @@ def test_trainings_that_end_elsewhere_are_lost(workdir: Path, tmp_path: Path, mo
     monkeypatch.setattr(kills.tempfile, "tempdir", str(tmp_path))
     assert kills._chain(tmp_path, tmp_path, None, {"rows": "b"}, 0) == ([], "ends elsewhere: rows")
     assert kills._chain(tmp_path, tmp_path, None, {"rows": "b"}, 0) == ([], "")
+
+
+class Ended:
+    """A process that has ended, or never does."""
+
+    def __init__(self, returncode: int | None) -> None:
+        self.returncode, self.killed = returncode, False
+
+    def kill(self) -> None:
+        self.killed = True
+
+    def communicate(self, timeout: float | None = None) -> tuple[str, str]:
+        if self.returncode is None and not self.killed:
+            raise subprocess.TimeoutExpired("train", timeout or 0)
+        return "", "error: something"
+
+
+def test_processes_that_live_on_or_train_something_else_are_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rows = "step,loss,validation_loss\n1,-2.0,-3.0\n"
+    (tmp_path / "metrics.csv").write_text(rows)
+    # Of a run: the processes that lose one, those that go on, and what the latter leave behind.
+    runs = [
+        ([3, -9], [0], rows, ""),
+        ([None, -9], [0], rows, "lived on for 60 s"),
+        ([3, -9], [2], rows, "exit 2: error: something"),
+        ([3, -9], [0], rows.replace("-2.0", "-2.1"), "losses differ by 5.0e-02"),
+        ([3, -9], [0], rows.replace("1,", "2,"), "losses differ by inf"),
+    ]
+    monkeypatch.setattr(scale.time, "sleep", lambda _: None)
+    for number, (losing, going, left, expected) in enumerate(runs):
+        codes = iter([losing, going])
+
+        def start(config: Path, workdir: Path, count: int, codes=codes, left=left) -> list[Ended]:
+            workdir.mkdir(exist_ok=True)
+            (workdir / "metrics.csv").write_text(left)
+            # The first is the one that lives on, whichever is killed.
+            return [Ended(code) for code in next(codes)]
+
+        monkeypatch.setattr(scale.training, "start_together", start)
+        monkeypatch.setattr(scale.random.Random, "choice", lambda self, of: of[-1])
+        found = scale.run(0, number, tmp_path, tmp_path)
+        assert found.tried == 1
+        assert expected in (found.lost or [""])[0] and bool(found.lost) == bool(expected)
 
 
 def test_the_table_counts_and_any_loss_is_the_exit_code(

@@ -1,4 +1,4 @@
-"""The command line bin/soak: kills, corruption, fuzz and stream within a time budget; see --help."""
+"""The command line bin/soak: kills, corruption, fuzz, stream and scale within a time budget; see --help."""
 
 import os
 import re
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from mdnvo_jax.soak.tally import Tally
 
 # Shares of the time that the parts get; a training takes longest to come to its end.
-SHARES = {"kills": 0.55, "corruption": 0.15, "fuzz": 0.15, "stream": 0.15}
+SHARES = {"kills": 0.4, "corruption": 0.15, "fuzz": 0.15, "stream": 0.15, "scale": 0.15}
 # A part may finish what it has begun.
 _GRACE_S = 900
 _TESTS = Path(__file__).parents[2] / "tests" / "data" / "test_hostile.py"
@@ -30,7 +30,7 @@ def main(arguments: Sequence[str]) -> None:
     Raises:
       SystemExit: with 1, where anything was lost.
     """
-    parser = Parser("bin/soak", description="Kill, damage, fuzz and stream for some time; print one table.")
+    parser = Parser("bin/soak", description="Kill, damage, fuzz, stream and scale for some time; print one table.")
     parser.add_argument("--minutes", type=float, default=60, help="in all, but for what was begun before [60]")
     parser.add_argument("--seed", type=int, default=int(time.time()) % 1_000_000, help="of every draw [by the clock]")
     parser.add_argument("--parts", nargs="+", choices=list(SHARES), default=list(SHARES), help="only these [all]")
@@ -87,10 +87,12 @@ def soak(seconds: float, seed: int, parts: Sequence[str]) -> "list[Tally]":
 
 def _part(part: str, seconds: float, seed: int, folder: Path) -> "Tally":
     """Return the tally of one part."""
-    from mdnvo_jax.soak import damage, kills, stream
+    from mdnvo_jax.soak import damage, kills, scale, stream
 
     if part == "kills":
         return kills.run(seconds, seed, folder / "drive" / "config.py", folder / "run")
+    if part == "scale":
+        return scale.run(seconds, seed, folder / "drive" / "config.py", folder / "run")
     if part == "corruption":
         return damage.run(seconds, seed, folder / "run")
     return stream.run(seconds, seed, folder / "run") if part == "stream" else fuzz(seconds, seed)

@@ -2,6 +2,7 @@
 
 import json
 import os
+import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -45,12 +46,22 @@ def write_drive(folder: Path) -> Path:
     return path
 
 
-def start(config: Path, workdir: Path) -> subprocess.Popen[str]:
+def start(config: Path, workdir: Path, *options: str) -> subprocess.Popen[str]:
     """Start the training, or go on with it where there is a checkpoint."""
     resume = ["--resume"] if checkpoint.any_step(workdir) else []
-    command = [sys.executable, "-m", "mdnvo_jax.train", str(config), "--workdir", str(workdir), *resume]
+    command = [sys.executable, "-m", "mdnvo_jax.train", str(config), "--workdir", str(workdir), *resume, *options]
     environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
+
+
+def start_together(config: Path, workdir: Path, count: int) -> list[subprocess.Popen[str]]:
+    """Start the training by `count` processes that meet over loopback, or go on with it; one is not told of others."""
+    if count == 1:
+        return [start(config, workdir)]
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        together = ["--coordinator", f"localhost:{probe.getsockname()[1]}", "--processes", str(count)]
+    return [start(config, workdir, *together, "--process", str(number)) for number in range(count)]
 
 
 def result(workdir: Path) -> dict[str, Any]:
