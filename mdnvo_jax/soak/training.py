@@ -22,15 +22,19 @@ config = Config(
         root={root!r}, camera_folder="image_0", train_sequences=("00",), validation_tail=0.2,
         window=3, shortest_window=2, mirror=0.5, reverse=0.2, photometric=0.5,
     ),
-    training=TrainingConfig(batch_size=4, epochs=6, plateau_patience=0, plateau_threshold=10.0),
+    training=TrainingConfig(batch_size=4, epochs={epochs}, plateau_patience=0, plateau_threshold=10.0),
 )
 """
 # Longer than any of these trainings takes on any machine: what takes longer hangs.
 TIMEOUT_S = 300
 
 
-def write_drive(folder: Path) -> Path:
-    """Write 60 frames of noise in KITTI's layout and the config of a training on them; return the config's path."""
+def write_drive(folder: Path, epochs: int = 6) -> Path:
+    """Write 60 frames of noise in KITTI's layout and the config of a training on them; return the config's path.
+
+    48 frames train: 45 windows of three steps, 11 batches of four in an epoch. The plateau's threshold asks for more
+    than any epoch improves by.
+    """
     generator = np.random.default_rng(0)
     images = folder / "sequences" / "00" / "image_0"
     images.mkdir(parents=True)
@@ -42,7 +46,7 @@ def write_drive(folder: Path) -> Path:
         rows.append(f"1 0 0 0 0 1 0 0 0 0 1 {frame * (1 + 0.01 * frame):.6f}\n")
     (folder / "poses" / "00.txt").write_text("".join(rows))
     path = folder / "config.py"
-    path.write_text(CONFIG.format(root=str(folder)))
+    path.write_text(CONFIG.format(root=str(folder), epochs=epochs))
     return path
 
 
@@ -54,14 +58,14 @@ def start(config: Path, workdir: Path, *options: str) -> subprocess.Popen[str]:
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)
 
 
-def start_together(config: Path, workdir: Path, count: int) -> list[subprocess.Popen[str]]:
+def start_together(config: Path, workdir: Path, count: int, *options: str) -> list[subprocess.Popen[str]]:
     """Start the training by `count` processes that meet over loopback, or go on with it; one is not told of others."""
     if count == 1:
-        return [start(config, workdir)]
+        return [start(config, workdir, *options)]
     with socket.socket() as probe:
         probe.bind(("localhost", 0))
         together = ["--coordinator", f"localhost:{probe.getsockname()[1]}", "--processes", str(count)]
-    return [start(config, workdir, *together, "--process", str(number)) for number in range(count)]
+    return [start(config, workdir, *together, "--process", str(number), *options) for number in range(count)]
 
 
 def result(workdir: Path) -> dict[str, Any]:

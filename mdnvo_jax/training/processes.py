@@ -94,8 +94,9 @@ def together() -> Iterator[None]:
     """
     try:
         yield
-    except jax.errors.JaxRuntimeError as error:
-        if jax.process_count() == 1:
+    except (jax.errors.JaxRuntimeError, ValueError) as error:
+        # Either is what a broken connection is raised as.
+        if jax.process_count() == 1 or isinstance(error, InputError):
             raise
         first = str(error).splitlines()[0][:200]
         print(
