@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import jax
@@ -58,13 +59,25 @@ def make_batch(seed: int = 0, batch: int = 4) -> step.Batch:
     return {"images": jnp.asarray(images), "steps": jnp.asarray(steps), "mask": jnp.asarray(mask)}
 
 
+Step = Callable[[State, step.Batch], tuple[State, step.Metrics]]
+
+
+def compiled(config: Config) -> Step:
+    return jax.jit(step.bind(step.train_step, build(config.image, config.model), config))
+
+
+@pytest.fixture(scope="module")
+def mixture_step() -> Step:
+    """The step of `CONFIG`, compiled once."""
+    return compiled(CONFIG)
+
+
 @pytest.mark.parametrize("head", ["mixture", "regression"])
-def test_training_on_one_batch_learns_it(head: str) -> None:
+def test_training_on_one_batch_learns_it(mixture_step: Step, head: str) -> None:
     config = with_(CONFIG, model={"head": head})
-    network = build(config.image, config.model)
     state = first_state(config)
     batch = make_batch()
-    train_step = jax.jit(step.bind(step.train_step, network, config))
+    train_step = mixture_step if head == "mixture" else compiled(config)
     losses = []
     for _ in range(40):
         state, metrics = train_step(state, batch)
@@ -88,14 +101,24 @@ class Linear:
         return (outputs, None), {"batch_stats": {"mean": brightness.mean()}}
 
 
+def full_batch(seed: int = 0) -> step.Batch:
+    """A batch without padding, in which every part of equal size weighs the same."""
+    batch = make_batch(seed)
+    return {**batch, "mask": jnp.ones_like(batch["mask"])}
+
+
+def linear_state(config: Config) -> State:
+    size = mixture.outputs_size(config.model.components)
+    variables = {"params": {"head": jnp.linspace(-0.2, 0.3, size)}, "batch_stats": {"mean": jnp.zeros(())}}
+    return initial_state(variables, config, LABELS)
+
+
 def test_a_step_that_is_not_finite_is_skipped_and_counted() -> None:
-    size = mixture.outputs_size(CONFIG.model.components)
-    variables = {"params": {"head": jnp.full(size, 0.1)}, "batch_stats": {"mean": jnp.zeros(())}}
     config = with_(CONFIG, training={"skip_nonfinite": 2})
     good, bad = make_batch(), make_batch()
     bad["steps"] = bad["steps"].at[1, 0, 3].set(jnp.nan)
     train_step = jax.jit(step.bind(step.train_step, Linear(), config))
-    before, metrics = train_step(initial_state(variables, config, LABELS), good)
+    before, metrics = train_step(linear_state(config), good)
     assert metrics[SKIPPED] == 0
     after, metrics = train_step(before, bad)
     assert not np.isfinite(metrics["loss"]) and metrics[SKIPPED] == 1
@@ -111,25 +134,20 @@ def test_a_step_that_is_not_finite_is_skipped_and_counted() -> None:
     assert metrics[SKIPPED] == 0 and np.isnan(spoilt.model.params["head"]).any()
 
 
-def test_every_step_draws_its_own_dropout_and_the_same_one_again() -> None:
-    network = build(CONFIG.image, CONFIG.model)
-    config = with_(CONFIG, training={"learning_rate": 0.0})
-    state = first_state(config)
-    train_step = jax.jit(step.bind(step.train_step, network, config))
-    after, first = train_step(state, make_batch())
-    _, second = train_step(after, make_batch())
-    _, again = train_step(state, make_batch())
+def test_every_step_draws_its_own_dropout_and_the_same_one_again(mixture_step: Step) -> None:
+    state = first_state(CONFIG)
+    _, first = mixture_step(state, make_batch())
+    _, second = mixture_step(state._replace(step=state.step + 1), make_batch())
+    _, again = mixture_step(state, make_batch())
     assert first["loss"] != second["loss"]
     assert first["loss"] == again["loss"]
 
 
 def test_clipping_bounds_the_gradient_that_adam_sees() -> None:
-    network = build(CONFIG.image, CONFIG.model)
     moments = []
     for clip in (0.0, 1e-3):
         config = with_(CONFIG, training={"gradient_clip": clip})
-        state = first_state(config)
-        state, metrics = jax.jit(step.bind(step.train_step, network, config))(state, make_batch())
+        state, metrics = jax.jit(step.bind(step.train_step, Linear(), config))(linear_state(config), make_batch())
         first_moments = [
             leaf for path, leaf in jax.tree.leaves_with_path(state.optimiser) if ".mu" in jax.tree_util.keystr(path)
         ]
@@ -143,15 +161,14 @@ def test_clipping_bounds_the_gradient_that_adam_sees() -> None:
 def test_validation_does_not_see_padding() -> None:
     network = build(CONFIG.image, CONFIG.model)
     model = first_state(CONFIG).model
-    validate = step.bind(step.validation_step, network, CONFIG)
+    validate = jax.jit(step.bind(step.validation_step, network, CONFIG))
     batch = make_batch()
     whole = validate(model, batch)
-    # The same windows in two batches of three, the second filled up with windows that do not count.
-    padded = [
-        {name: value[:3] for name, value in batch.items()},
-        {name: value[jnp.array([3, 0, 0])] for name, value in batch.items()},
-    ]
-    padded[1]["mask"] = padded[1]["mask"].at[1:].set(False)
+    # The same windows in two batches, filled up with windows that do not count.
+    padded = []
+    for rows, count in (([0, 1, 2, 2], 3), ([3, 0, 0, 0], 1)):
+        part = {name: value[jnp.array(rows)] for name, value in batch.items()}
+        padded.append({**part, "mask": part["mask"].at[count:].set(False)})
     sums = jax.tree.map(jnp.add, *[validate(model, part) for part in padded])
     for name, value in step.validation_metrics(whole).items():
         np.testing.assert_allclose(step.validation_metrics(sums)[name], value, rtol=1e-4)
@@ -194,18 +211,6 @@ def test_the_end_of_an_epoch_renews_the_residual_scale_and_forgets_the_sums() ->
     np.testing.assert_allclose(state.plateau.best_value, 1)
     assert not any(state.sums.values())
     assert int(state.epoch) == 1
-
-
-def full_batch(seed: int = 0) -> step.Batch:
-    """A batch without padding, in which every part of equal size weighs the same."""
-    batch = make_batch(seed)
-    return {**batch, "mask": jnp.ones_like(batch["mask"])}
-
-
-def linear_state(config: Config) -> State:
-    size = mixture.outputs_size(config.model.components)
-    variables = {"params": {"head": jnp.linspace(-0.2, 0.3, size)}, "batch_stats": {"mean": jnp.zeros(())}}
-    return initial_state(variables, config, LABELS)
 
 
 def test_a_batch_in_parts_gives_the_step_of_the_whole() -> None:
@@ -366,7 +371,7 @@ def test_a_network_with_flow_learns_it_beside_the_steps_and_predicts_without_it(
     after = losses(state)
     # Both go down; the beta-NLL itself says little: its weights fall with sigma.
     assert after[0] < before[0] - 1 and after[1] < 0.7 * before[1]
-    validated = step.bind(step.validation_step, network, config)(state.model, make_batch())
+    validated = jax.jit(step.bind(step.validation_step, network, config))(state.model, make_batch())
     assert np.isfinite(validated["loss"])
 
 
