@@ -10,7 +10,7 @@ from pathlib import Path
 from mdnvo_jax import files
 from mdnvo_jax.errors import InputError, Parser, exit_code
 
-SECTIONS = ("train", "predict", "mixture", "input", "start", "growth", "lstm")
+SECTIONS = ("train", "predict", "mixture", "input", "start", "growth", "lstm", "options")
 
 
 def main(arguments: Sequence[str]) -> None:

@@ -239,3 +239,53 @@ def test_the_momentum_is_the_share_of_the_statistics_that_a_batch_leaves():
         kept[momentum] = updated["batch_stats"]["conv1"]["mean"]
     # The mean starts at zero: what a batch adds is in proportion to one less the momentum.
     np.testing.assert_allclose(kept[0.9], 10 * kept[0.99], rtol=1e-5)
+
+
+def test_devices_along_an_axis_have_the_moments_of_all(rng):
+    x, mask = rng.normal(3, 2, (2, 5, 4, 3, 6)).astype(np.float32), rng.random((2, 5)) < 0.6
+    of_each = jax.vmap(lambda x, mask: batch_moments(x, mask, "shares"), axis_name="shares")(x, mask)
+    of_all = batch_moments(jnp.asarray(x.reshape(10, 4, 3, 6)), jnp.asarray(mask.reshape(10)))
+    for each, whole in zip(of_each, of_all, strict=True):
+        np.testing.assert_allclose(each, jnp.stack([whole, whole]), rtol=1e-5)
+
+
+@pytest.fixture
+def shallow_gradient(rng, monkeypatch):
+    """Return maps, new statistics and gradient of a stack of four layers, with the fields that are given."""
+    monkeypatch.setattr("mdnvo_jax.model.conv.LAYERS", LAYERS[:4])
+    pairs = jnp.asarray(rng.normal(size=(3, 24, 32, 2)), jnp.float32)
+    mask = jnp.array([True, True, False])
+    variables = ConvStack(1 / 16, 0.0).init(jax.random.key(0), pairs, mask, train=False)
+
+    def run(**fields):
+        stack = ConvStack(1 / 16, 0.2, **fields)
+
+        def loss(params):
+            given = {"params": params, "batch_stats": variables["batch_stats"]}
+            rngs = {"dropout": jax.random.key(1)}
+            maps, updated = stack.apply(
+                given, pairs, mask, train=True, method="maps", mutable=["batch_stats"], rngs=rngs
+            )
+            return jnp.sum(maps[-1] ** 2), (maps, updated["batch_stats"])
+
+        (_, found), gradient = jit(jax.value_and_grad(loss, has_aux=True))(variables["params"])
+        return *found, gradient
+
+    return run
+
+
+def test_maps_that_are_computed_twice_change_nothing(shallow_gradient):
+    found, expected = shallow_gradient(rematerialise=True), shallow_gradient()
+    for (path, leaf), (_, other) in zip(*map(jax.tree.leaves_with_path, (found, expected)), strict=True):
+        np.testing.assert_allclose(leaf, other, rtol=1e-4, atol=1e-4, err_msg=jax.tree_util.keystr(path))
+
+
+def test_maps_in_bfloat16_are_near_and_all_else_is_float32(shallow_gradient):
+    found, expected = shallow_gradient(activations="bfloat16"), shallow_gradient()
+    assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {jnp.dtype("float32")}
+    for (path, leaf), (_, other) in zip(*map(jax.tree.leaves_with_path, (found, expected)), strict=True):
+        # Eight bits of a number, and sums of many whose errors are not alike: two percent of their norm.
+        away = np.linalg.norm(leaf - other) / np.linalg.norm(other)
+        assert away < 0.02, (jax.tree_util.keystr(path), away)
+    # The maps themselves have no more digits than bfloat16 keeps.
+    np.testing.assert_array_equal(found[0][0], found[0][0].astype(jnp.bfloat16).astype(jnp.float32))

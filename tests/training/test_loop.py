@@ -152,7 +152,7 @@ def test_two_processes_train_as_one_and_any_number_goes_on(
     for row, expected in zip(rows(tmp_path), rows(uninterrupted), strict=True):
         assert row["step"] == expected["step"]
         for name in ("loss", "parameter_norm", "sigma_translation_m_q50", "validation_loss"):
-            assert float(row[name]) == pytest.approx(float(expected[name]), rel=2e-4), name
+            assert float(row[name]) == pytest.approx(float(expected[name]), rel=2e-3), name
     assert float(rows(tmp_path)[0]["loss"]) == pytest.approx(float(rows(uninterrupted)[0]["loss"]), rel=1e-6)
 
 

@@ -1,0 +1,87 @@
+"""Section options: what the options that save memory save, and what they cost."""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+from mdnvo_jax.benchmark import material
+from mdnvo_jax.benchmark.outcome import Outcome, Settings, compared
+from mdnvo_jax.benchmark.timing import RATIO, interleaved
+from mdnvo_jax.config import Config
+from mdnvo_jax.evaluation.tables import Column, Row, Table, Value
+from mdnvo_jax.model.network import build
+from mdnvo_jax.training import parallel, step
+
+_ROUNDS = 7
+_BUDGET_S = 120.0
+_PLAIN = "none"
+# By name: fields of `ModelConfig`, fields of `TrainingConfig`.
+_OPTIONS: dict[str, tuple[dict[str, Any], dict[str, Any]]] = {
+    _PLAIN: ({}, {}),
+    "model.activations bfloat16": ({"activations": "bfloat16"}, {}),
+    "model.rematerialise": ({"rematerialise": True}, {}),
+    "training.accumulate 2": ({}, {"accumulate": 2}),
+    "training.accumulate 4": ({}, {"accumulate": 4}),
+    "rematerialise, accumulate 4": ({"rematerialise": True}, {"accumulate": 4}),
+}
+_SHORT = (_PLAIN, "rematerialise, accumulate 4")
+
+
+def measure(settings: Settings) -> Outcome:
+    """Measure memory and time of a training step."""
+    outcome = Outcome()
+    config = material.small_config(32, 64, 1 / 32, batch=4) if settings.short else material.paper_config(96, 320, 0.25)
+    steps, held = {}, {}
+    for name in _SHORT if settings.short else _OPTIONS:
+        steps[name], held[name] = _compiled(_with(config, name))
+    found = interleaved(steps, settings.rounds(_ROUNDS), budget_s=_BUDGET_S)
+    outcome.times(f"options {material.described(config)}", found)
+    rows: list[Row] = [
+        {
+            **compared(name, found, _PLAIN),
+            "held": Value(held[name] / 1e6),
+            "share": Value(held[name] / held[_PLAIN]),
+        }
+        for name in found
+    ]
+    columns = [
+        Column("contender", "option"),
+        Column("held", "held between forward and backward, MB", 0),
+        Column("share", "of that without", 2),
+        Column("ms", "ms a step", 1),
+        Column("ratio", "time over that without", 2),
+        Column("n", "rounds"),
+    ]
+    notes = [
+        f"{material.described(config)}, batch {config.training.batch_size} x window {config.data.window}. Held: the "
+        "temporary memory that XLA plans for the compiled step, beside parameters, optimiser and batch. " + RATIO
+    ]
+    outcome.tables.append(Table("Options of a training step", columns, rows, notes=notes))
+    return outcome
+
+
+def _with(config: Config, name: str) -> Config:
+    """Return `config` with the fields of an option."""
+    model, training = _OPTIONS[name]
+    return dataclasses.replace(
+        config,
+        model=dataclasses.replace(config.model, **model),
+        training=dataclasses.replace(config.training, **training),
+    )
+
+
+def _compiled(config: Config) -> tuple[Callable[[], Any], int]:
+    """Return what takes a training step, and the bytes that it holds in between."""
+    mesh = parallel.make_mesh(config.training.batch_size, 1, accumulate=config.training.accumulate)
+    network = build(config.image, config.model)
+    take = parallel.compile_step(step.bind(step.train_step, network, config), mesh, donate=True)
+    batch = parallel.place(material.training_batch(config), mesh)
+    state = material.fresh_state(config, mesh)
+    compiled = take.lower(state, batch).compile()
+
+    def run() -> Any:
+        nonlocal state
+        state, metrics = compiled(state, batch)
+        return metrics
+
+    return run, compiled.memory_analysis().temp_size_in_bytes
