@@ -360,12 +360,9 @@ def _read_about(step_folder: Path) -> dict[str, Any]:
     return about
 
 
-def write_about(step_folder: Path, config: Config) -> None:
-    """Put another experiment into a copy of a step's folder, for `read_config`; its checksums of the model stay."""
-    checksums = _read_about(step_folder).get("checksums", {})
-    about = _about(config, {name: value for name, value in checksums.items() if name == "model"})
-    if not checksums:
-        about = {"version": 1, "config": about["config"]}
+def write_about(step_folder: Path, config: Config, model: Model) -> None:
+    """Put another experiment into a copy of a step's folder, for `read_config`, with the checksums of its model."""
+    about = _about(config, {"model": checksum.of_arrays(model)})
     files.write_text(step_folder / "about" / _JSON_FILE, json.dumps(about))
 
 

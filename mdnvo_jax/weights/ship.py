@@ -31,7 +31,7 @@ def ship(source: str | Path, target: Path, *, force: bool = False) -> Path:
         its sigmas were not recalibrated; or it is too large; or `target` is not empty and `force` is false.
     """
     step = checkpoint.locate(source)
-    config = checkpoint.read_config(step)
+    model, config, _ = checkpoint.trained(step)
     _check_origin(step, config)
     fitted = recalibration.read(step)
     if fitted is None:
@@ -42,7 +42,7 @@ def ship(source: str | Path, target: Path, *, force: bool = False) -> Path:
         staged = Path(name) / target.name
         for item in ("model", "about"):
             shutil.copytree(step / item, staged / item, ignore=shutil.ignore_patterns(_LEFT_OUT))
-        checkpoint.write_about(staged, dataclasses.replace(config, data=data))
+        checkpoint.write_about(staged, dataclasses.replace(config, data=data), model)
         recalibration.write(staged, fitted)
         size = folder_bytes(staged)
         if size > LARGEST_BYTES:

@@ -246,7 +246,9 @@ def test_checkpoints_of_the_first_version_are_read(workdir: Path, first_state: S
     assert found.step == 9
     jax.tree.map(np.testing.assert_array_equal, found.state, state)
     assert predictor.load(step).config == CONFIG
-    checkpoint.write_about(step, CONFIG)
+    # A copy of it gets them.
+    checkpoint.write_about(step, CONFIG, checkpoint.trained(step)[0])
+    assert json.loads((step / "about" / "metadata").read_text())["version"] == 2
     assert predictor.load(step).config == CONFIG
 
 
@@ -258,9 +260,9 @@ def test_checkpoints_of_other_versions_are_refused(workdir: Path, version: objec
             read(workdir)
 
 
-def test_a_copy_with_another_experiment_keeps_its_checksums(workdir: Path) -> None:
+def test_a_copy_with_another_experiment_has_the_checksums_of_its_model(workdir: Path) -> None:
     step = workdir / "checkpoints" / "9"
-    checkpoint.write_about(step, CONFIG)
+    checkpoint.write_about(step, CONFIG, checkpoint.trained(step)[0])
     assert predictor.load(step).config == CONFIG
     other_parameters(step)
     with pytest.raises(InputError, match="damaged"):
