@@ -43,7 +43,7 @@ def split(mesh: Mesh) -> NamedSharding:
     return NamedSharding(mesh, PartitionSpec("data"))
 
 
-def compile_step(function: Callable[..., Any], mesh: Mesh, *, donate: bool) -> Callable[..., Any]:
+def compile_step(function: Callable[..., Any], mesh: Mesh, *, donate: bool) -> jax.stages.Wrapped:
     """Compile `function(state, batch)` for the mesh; everything it returns is on every device.
 
     Args:
