@@ -84,4 +84,6 @@ def _compiled(config: Config) -> tuple[Callable[[], Any], int]:
         state, metrics = compiled(state, batch)
         return metrics
 
-    return run, compiled.memory_analysis().temp_size_in_bytes
+    memory = compiled.memory_analysis()
+    assert memory is not None, "every backend that is measured here plans its memory"
+    return run, memory.temp_size_in_bytes
