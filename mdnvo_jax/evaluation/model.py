@@ -51,6 +51,8 @@ def from_options(options: argparse.Namespace) -> Report:
 
     if options.block < 1:
         raise InputError(f"--block is {options.block}: expected 1 frame or more")
+    if options.other_lenses and options.dataset != "synthetic":
+        raise InputError(f"--other-lenses is for --dataset synthetic, and this is {options.dataset}: leave it out")
     model = predictor.load(
         options.checkpoint, recalibrated=not options.no_recalibration, camera_height_m=options.camera_height
     )
@@ -192,8 +194,6 @@ def sequences(options: argparse.Namespace, config: "Config") -> list["Sequence"]
             config = dataclasses.replace(config, data=data)
         seeds = [int(name) for name in options.sequences]
         return load.synthetic_sequences(seeds, config, other_lenses=options.other_lenses)
-    if options.other_lenses:
-        raise InputError(f"--other-lenses is for --dataset synthetic, and this is {options.dataset}: leave it out")
     if not options.root:
         raise InputError(f"--root is missing: give the folder of {_ROOTS[options.dataset]}")
     given = {"camera_folder": options.camera_folder, "version": options.nuscenes_version}

@@ -176,7 +176,7 @@ class ConvStack(nn.Module):
           Nine times `[N, h, w, D]`, float32.
         """
         block_type = nn.remat(ConvBlock, static_argnums=(3,)) if self.rematerialise and train else ConvBlock
-        x = pairs.astype(self.activations) if train else pairs
+        x = pairs.astype(jnp.bfloat16) if train and self.activations == "bfloat16" else pairs
         maps = []
         for layer in LAYERS:
             channels = layer_channels(layer, self.multiplier)

