@@ -125,11 +125,8 @@ def track(
     from mdnvo_jax.data.sequence import rigid
 
     orbslam_system.require()
-    if sequence.camera is None or min(sequence.camera[:2]) <= 0:
-        raise InputError(
-            f"{sequence.name} has {'no camera' if sequence.camera is None else f'the camera {sequence.camera}'}: "
-            "ORB-SLAM needs the intrinsics, of a focal length above 0: give --camera fx,fy,cx,cy"
-        )
+    if sequence.camera is None:
+        raise InputError(f"{sequence.name} has no camera: ORB-SLAM needs the intrinsics: give --camera fx,fy,cx,cy")
     times_s, own_rate_hz = _times(sequence)
     fed_hz = own_rate_hz if rate_hz is None else rate_hz
     settings = {
