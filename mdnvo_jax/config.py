@@ -47,8 +47,8 @@ class ModelConfig:
     # Type of the maps between the convolutions while training. "bfloat16" halves their memory; parameters, statistics,
     # the LSTM and the density stay float32. Not given in the paper.
     activations: Literal["float32", "bfloat16"] = "float32"
-    # Compute the maps of the convolutions a second time in the backward pass instead of keeping them: less memory, a
-    # third more time.
+    # Compute the maps of the convolutions a second time in the backward pass instead of keeping them: less memory for
+    # more time, on accelerators. On a processor it saves nothing (BENCHMARKS.md).
     rematerialise: bool = False
     # Paper: dropout 0.1 on the convolutions.
     conv_dropout: float = 0.1
@@ -141,7 +141,7 @@ class TrainingConfig:
     seed: int = 0
     batch_size: int = 8
     # Parts that a batch is taken in, one after another, to save memory: one step with the mean of their gradients.
-    # BatchNorm normalises each part by itself.
+    # BatchNorm normalises each part by itself. Slow on a processor (BENCHMARKS.md).
     accumulate: int = 1
     # Paper: about 40 epochs.
     epochs: int = 40
