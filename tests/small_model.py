@@ -9,8 +9,8 @@ import numpy as np
 from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig
 from mdnvo_jax.model.head import Labels
 from mdnvo_jax.model.network import build
-from mdnvo_jax.training import checkpoint
 from mdnvo_jax.training.state import Model, initial_state, initial_variables
+from mdnvo_jax.training.store import Store
 
 CONFIG = Config(
     image=ImageConfig(height=32, width=64, channels=1, camera=(40.0, 40.0, 31.5, 15.5)),
@@ -48,7 +48,7 @@ def trained() -> Model:
 
 def save(folder: Path, config: Config = CONFIG) -> Path:
     """Write the model as a training of `config`, which has the network of `CONFIG`, does, and return the folder."""
-    store = checkpoint.Store(folder, keep_latest=1)
+    store = Store(folder, keep_latest=1)
     variables = initial_variables(build(CONFIG.image, CONFIG.model), CONFIG)
     store.save(initial_state(variables, CONFIG, LABELS)._replace(model=trained()), None, config, 1.0)
     store.close()

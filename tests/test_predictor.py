@@ -18,8 +18,8 @@ from mdnvo_jax.errors import InputError
 from mdnvo_jax.mixture import Mixture
 from mdnvo_jax.model.head import mixture_from_outputs
 from mdnvo_jax.model.network import build
-from mdnvo_jax.training import checkpoint
 from mdnvo_jax.training.state import initial_state, initial_variables
+from mdnvo_jax.training.store import Store
 
 FRAMES = small_model.FRAMES[:12]
 
@@ -201,7 +201,7 @@ def test_windows_that_leave_steps_out_are_refused(model: predictor.Predictor, ho
 def test_a_checkpoint_that_is_none_or_does_not_fit_is_named(workdir: Path, tmp_path: Path) -> None:
     with pytest.raises(InputError, match="no checkpoint in"):
         predictor.load(tmp_path)
-    store = checkpoint.Store(tmp_path, keep_latest=1)
+    store = Store(tmp_path, keep_latest=1)
     state = initial_state(initial_variables(build(CONFIG.image, CONFIG.model), CONFIG), CONFIG, LABELS)
     wrong = dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, components=3))
     store.save(state, None, wrong, 1.0)

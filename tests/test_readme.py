@@ -11,8 +11,8 @@ import numpy as np
 from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig
 from mdnvo_jax.model.head import Labels
 from mdnvo_jax.model.network import build
-from mdnvo_jax.training import checkpoint
 from mdnvo_jax.training.state import initial_state, initial_variables
+from mdnvo_jax.training.store import Store
 
 README = Path(__file__).resolve().parents[1] / "README.md"
 
@@ -24,7 +24,7 @@ def test_the_blocks_of_the_readme_run(tmp_path: Path) -> None:
         data=DataConfig(window=4),
     )
     labels = Labels(np.array([0, 0, 1, 0, 0, 0.0]), np.ones(6))
-    store = checkpoint.Store(tmp_path / "runs" / "small", keep_latest=1)
+    store = Store(tmp_path / "runs" / "small", keep_latest=1)
     variables = initial_variables(build(config.image, config.model), config)
     store.save(initial_state(variables, config, labels), None, config, 1.0)
     store.close()

@@ -16,14 +16,15 @@ from mdnvo_jax.model.network import build
 from mdnvo_jax.soak import __main__ as command
 from mdnvo_jax.soak import damage, kills, scale, stream
 from mdnvo_jax.soak.tally import Tally, as_line, from_line, table
-from mdnvo_jax.training import checkpoint, checksum
+from mdnvo_jax.training import checksum
 from mdnvo_jax.training.state import initial_state, initial_variables
+from mdnvo_jax.training.store import Store
 
 
 @pytest.fixture(scope="module")
 def workdir(tmp_path_factory: pytest.TempPathFactory) -> Path:
     workdir = tmp_path_factory.mktemp("soak") / "run"
-    store = checkpoint.Store(workdir, keep_latest=2)
+    store = Store(workdir, keep_latest=2)
     state = initial_state(initial_variables(build(CONFIG.image, CONFIG.model), CONFIG), CONFIG, LABELS)
     for step in (1, 2):
         state = state._replace(model=small_model.trained(), step=jnp.asarray(step), epoch=jnp.asarray(step))

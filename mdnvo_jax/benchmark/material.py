@@ -14,8 +14,9 @@ from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig, Train
 from mdnvo_jax.data.sequence import Sequence
 from mdnvo_jax.model.head import Labels
 from mdnvo_jax.model.network import Network, Variables, build, template
-from mdnvo_jax.training import checkpoint, parallel
+from mdnvo_jax.training import parallel
 from mdnvo_jax.training.state import Model, State, initial_state
+from mdnvo_jax.training.store import Store
 
 # Rows and columns of KITTI's frames.
 KITTI_SIZE = (376, 1241)
@@ -156,7 +157,7 @@ def write_checkpoint(model: Model, config: Config, folder: Path) -> Path:
     variables = {"params": model.params, "batch_stats": model.batch_stats}
     # Prediction reads the model alone; the moments of Adam would take twice its space.
     state = initial_state(variables, config, LABELS)._replace(optimiser={"left_out": jnp.zeros(())})
-    store = checkpoint.Store(folder, keep_latest=1)
+    store = Store(folder, keep_latest=1)
     store.save(state, None, config, 1.0)
     store.close()
     return folder

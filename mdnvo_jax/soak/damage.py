@@ -16,6 +16,7 @@ from mdnvo_jax.model.network import build
 from mdnvo_jax.soak.tally import Tally
 from mdnvo_jax.training import checkpoint, checksum
 from mdnvo_jax.training.state import State, state_template
+from mdnvo_jax.training.store import Restored, Store
 
 
 def run(seconds: float, seed: int, workdir: Path) -> Tally:
@@ -73,15 +74,15 @@ def _only(workdir: Path, step: int, folder: Path) -> Path:
     return place
 
 
-def _restored(workdir: Path, template: State) -> checkpoint.Restored:
-    store = checkpoint.Store(workdir, keep_latest=2)
+def _restored(workdir: Path, template: State) -> Restored:
+    store = Store(workdir, keep_latest=2)
     try:
         return store.restore(template)
     finally:
         store.close()
 
 
-def _digest(found: checkpoint.Restored) -> str:
+def _digest(found: Restored) -> str:
     return checksum.of_json([checksum.of_arrays(found.state), found.data_state])
 
 

@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from mdnvo_jax.training import checkpoint, checksum
+from mdnvo_jax.training.store import any_step
 
 CONFIG = """
 from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig, TrainingConfig
@@ -52,7 +53,7 @@ def write_drive(folder: Path, epochs: int = 6) -> Path:
 
 def start(config: Path, workdir: Path, *options: str) -> subprocess.Popen[str]:
     """Start the training, or go on with it where there is a checkpoint."""
-    resume = ["--resume"] if checkpoint.any_step(workdir) else []
+    resume = ["--resume"] if any_step(workdir) else []
     command = [sys.executable, "-m", "mdnvo_jax.train", str(config), "--workdir", str(workdir), *resume, *options]
     environment = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment)

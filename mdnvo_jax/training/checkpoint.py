@@ -1,283 +1,45 @@
-"""Checkpoints: saved while training goes on, the newest and the best kept, read back whole or not at all."""
+"""What a checkpoint is: the folder of one step of a training, and how its model is read, whole or not at all.
 
-import contextlib
-import errno
+`store` saves and restores trainings.
+"""
+
 import json
 import math
 import os
-import shutil
-import sys
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import numpy as np
 import orbax.checkpoint as ocp
-from orbax.checkpoint import checkpoint_managers
 
 from mdnvo_jax import config as configuration
 from mdnvo_jax import files
 from mdnvo_jax.config import Config
 from mdnvo_jax.errors import InputError
 from mdnvo_jax.model.network import build
-from mdnvo_jax.training import checksum, processes
-from mdnvo_jax.training.state import SKIPPED, Model, State, state_template
+from mdnvo_jax.training import checksum
+from mdnvo_jax.training.state import Model, State, state_template
 
 # Raised when what is stored, or its meaning, changes. Version 1 has no checksums and does not count skipped steps.
 VERSION = 2
 _READABLE = (1, VERSION)
 FOLDER = "checkpoints"
-# Beside it: steps that could not be read, and for a moment the one that is being replaced.
-DAMAGED = "damaged_checkpoints"
-_REPLACED = "replaced_checkpoint"
-_METRIC = "validation_loss"
+METRIC = "validation_loss"
 # What orbax writes into a step's folder last.
-_FINISHED = "_CHECKPOINT_METADATA"
-# What a step's folder is called until it is whole.
-_UNFINISHED = ".orbax-checkpoint-tmp"
+FINISHED = "_CHECKPOINT_METADATA"
 # What orbax calls the one file of a JSON item.
 _JSON_FILE = "metadata"
 # What is raised for a checkpoint that is damaged, incomplete or of another shape depends on where the reader stumbles.
-_DAMAGE = (Exception,)
+DAMAGE = (Exception,)
 
 
-class UnsavedError(OSError):
-    """A checkpoint could not be written; those before it are whole."""
-
-
-class Restored(NamedTuple):
-    """A training as a checkpoint holds it."""
-
-    state: State
-    data_state: Any
-    step: int
-
-
-class Store:
-    """The checkpoints of one training, in `workdir/checkpoints`."""
-
-    def __init__(self, workdir: Path, keep_latest: int) -> None:
-        policies = [
-            checkpoint_managers.LatestN(keep_latest),
-            checkpoint_managers.BestN(get_metric_fn=_metric, reverse=True, n=1, keep_checkpoints_without_metrics=False),
-        ]
-        options = ocp.CheckpointManagerOptions(
-            preservation_policy=checkpoint_managers.AnyPreservationPolicy(policies),
-            # Without these two, metrics are not written and the best step is unknown after a restart.
-            best_fn=_metric,
-            best_mode="min",
-            cleanup_tmp_directories=True,
-        )
-        processes.by_leader(lambda: recover(workdir))
-        self._workdir = workdir.absolute()
-        self._manager = ocp.CheckpointManager(self._workdir / FOLDER, options=options)
-
-    def save(self, state: State, data_state: Any, config: Config, validation_loss: float = math.inf) -> None:
-        """Start to save the training; it goes on in the background.
-
-        A checkpoint of the same step, left by a training that was stopped before it could validate, is replaced.
-
-        Args:
-          state: the state after a whole number of steps.
-          data_state: the state of the iterator over batches, as JSON values.
-          config: the experiment, with the image configuration resolved.
-          validation_loss: infinite where this state was not validated, so that it never counts as the best.
-
-        Raises:
-          UnsavedError: the last one could not be written, and this one was not begun; or this one could not be begun.
-        """
-        self.wait()
-        step = int(state.step)
-        replaces = step in self._manager.all_steps()
-        if replaces:
-            self.wait()
-            self._move(step, _REPLACED)
-        data = {"iterator": data_state}
-        training = _without_model(state)
-        checksums = {
-            "model": checksum.of_arrays(state.model),
-            "training": checksum.of_arrays(training),
-            "data": checksum.of_json(data),
-        }
-        with self._writing():
-            self._check_room(state)
-            saved = self._manager.save(
-                step,
-                args=ocp.args.Composite(
-                    model=ocp.args.StandardSave(state.model),
-                    training=ocp.args.StandardSave(training),
-                    data=ocp.args.JsonSave(data),
-                    about=ocp.args.JsonSave(_about(config, checksums)),
-                ),
-                metrics={_METRIC: validation_loss},
-            )
-        # Orbax saves nothing, and says nothing, where it knows of a later step.
-        assert saved, f"step {step} was not saved: {self.steps()} are there"
-        if replaces:
-            self.wait()
-            processes.by_leader(lambda: recover(self._workdir))
-
-    def steps(self) -> list[int]:
-        """Return the steps that have a checkpoint, newest first."""
-        self._manager.reload()
-        return sorted(self._manager.all_steps(), reverse=True)
-
-    def restore(self, template: State) -> Restored:
-        """Return the newest checkpoint that is whole; newer ones are moved to `DAMAGED`, with a warning.
-
-        Args:
-          template: a state of the shapes, types and shardings to restore.
-
-        Raises:
-          InputError: there is none, or the newest is of a version that this release does not read.
-        """
-        damaged: dict[int, str] = {}
-        for step in self.steps():
-            about, wrong = None, ""
-            try:
-                about = self._check(step)
-            except InputError:
-                raise
-            except _DAMAGE as error:
-                wrong = _first(error)
-            if not processes.all_agree(not wrong) or about is None:
-                damaged[step] = wrong or "another process cannot read it"
-                continue
-            try:
-                restored = self._restore(step, about, template)
-            except _DAMAGE as error:
-                damaged[step] = _first(error)
-                continue
-            for number, why in damaged.items():
-                # Out of the way: a step is saved once, and this training will come to it again.
-                place = self._move(number, DAMAGED)
-                if processes.leads():
-                    print(
-                        f"warning: checkpoint {number} cannot be read and is now {place}; "
-                        f"going on from step {step} ({why})",
-                        file=sys.stderr,
-                    )
-            return restored
-        raise InputError(
-            f"none of the {len(damaged)} checkpoints in {self._manager.directory} can be read "
-            f"({'; '.join(f'{step}: {why}' for step, why in damaged.items())}): start again in another --workdir"
-        )
-
-    def _check(self, step: int) -> dict[str, Any]:
-        """Return what a checkpoint says about itself, after a look at every array of it; raise what is wrong."""
-        folder = Path(self._manager.directory) / str(step)
-        about = _read_about(folder)
-        for item in ("model", "training"):
-            checksum.check_stored(folder / item, about.get("checksums", {}).get(item))
-        return about
-
-    def _restore(self, step: int, about: dict[str, Any], template: State) -> Restored:
-        """Return the checkpoint of one step; all processes read it together."""
-        training = _without_model(template)
-        if about["version"] == 1:
-            training["sums"] = {name: leaf for name, leaf in training["sums"].items() if name != SKIPPED}
-        found = self._manager.restore(
-            step,
-            args=ocp.args.Composite(
-                model=ocp.args.StandardRestore(template.model),
-                training=ocp.args.StandardRestore(training),
-                data=ocp.args.JsonRestore(),
-            ),
-        )
-        if about["version"] == 1:
-            leaf = template.sums[SKIPPED]
-            found.training["sums"][SKIPPED] = jax.device_put(np.zeros(leaf.shape, leaf.dtype), leaf.sharding)
-        else:
-            checksum.check_json(found.data, about["checksums"]["data"], "data")
-        return Restored(State(model=found.model, **found.training), found.data["iterator"], step)
-
-    def _move(self, step: int, name: str) -> Path:
-        """Move a step's folder into the folder `name` beside the checkpoints, and return where it is now."""
-        place = self._workdir / name / str(step)
-
-        def move() -> None:
-            nonlocal place
-            place.parent.mkdir(exist_ok=True)
-            while place.exists():
-                place = place.with_name(f"{place.name}+")
-            (self._workdir / FOLDER / str(step)).rename(place)
-
-        processes.by_leader(move)
-        self._manager.reload()
-        return place
-
-    def wait(self) -> None:
-        """Return when everything that was saved is on disk.
-
-        Raises:
-          UnsavedError: the last checkpoint could not be written.
-        """
-        with self._writing():
-            self._manager.wait_until_finished()
-
-    def _check_room(self, state: State) -> None:
-        """Refuse what the disk has no room for, before orbax tries, and complains in many pages.
-
-        Raises:
-          OSError: there is less room than the arrays take.
-        """
-        needed = sum(leaf.nbytes for leaf in jax.tree.leaves(state))
-        free = shutil.disk_usage(self._workdir).free
-        if jax.process_count() == 1 and free < needed:
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    @contextlib.contextmanager
-    def _writing(self) -> Iterator[None]:
-        """Say in one line what orbax could not write, and remove what it has left of it."""
-        try:
-            yield
-        except (OSError, ValueError) as error:
-            if jax.process_count() == 1:
-                for left in (self._workdir / FOLDER).glob(f"*{_UNFINISHED}*"):
-                    shutil.rmtree(left, ignore_errors=True)
-            steps = self.steps()
-            whole = f"step {steps[0]} is the last whole one" if steps else "there is none yet"
-            full = os.strerror(errno.ENOSPC)
-            reason = full if full in str(error) else _first(error)
-            raise UnsavedError(f"a checkpoint cannot be written to {self._workdir} ({reason}); {whole}") from error
-
-    def close(self) -> None:
-        """Finish what is being written and let go. Whoever wants to know whether it was written waits before."""
-        with contextlib.suppress(UnsavedError):
-            self.wait()
-        self._manager.close()
-
-
-def recover(workdir: Path) -> None:
-    """Bring a training's folder in order that ended while a checkpoint was replaced by another of the same step."""
-    for old in (workdir / _REPLACED).glob("*"):
-        new = workdir / FOLDER / old.name
-        if (new / _FINISHED).exists():
-            shutil.rmtree(old)
-        else:
-            old.rename(new)
-    if (workdir / _REPLACED).is_dir():
-        (workdir / _REPLACED).rmdir()
-
-
-def _about(config: Config, checksums: dict[str, Any]) -> dict[str, Any]:
+def about_itself(config: Config, checksums: dict[str, Any]) -> dict[str, Any]:
     """Return what a checkpoint says about itself, given the checksums of its other items."""
     stored = json.loads(configuration.as_json(config))
     return {"version": VERSION, "config": stored, "checksums": {**checksums, "config": checksum.of_json(stored)}}
 
 
-def _without_model(state: State) -> dict[str, Any]:
-    """Return the part of a state that only training needs; the model is saved beside it, for prediction to read."""
-    return {name: value for name, value in state._asdict().items() if name != "model"}
-
-
-def _metric(metrics: dict[str, float]) -> float:
-    """Return what the best checkpoint is chosen by."""
-    return metrics[_METRIC]
-
-
-def _first(error: BaseException) -> str:
+def first_line(error: BaseException) -> str:
     """Return the first line of an error, shortened."""
     return f"{type(error).__name__}: {(str(error).splitlines() or [''])[0][:160]}"
 
@@ -287,17 +49,16 @@ def abstract(tree: Any, sharding: jax.sharding.Sharding | None = None) -> Any:
     return jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape, leaf.dtype, sharding=sharding), tree)
 
 
+def template(config: Config) -> State:
+    """Return the template of a training's state on one device."""
+    here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
+    return abstract(state_template(build(config.image, config.model), config), here)
+
+
 def steps_in(folder: Path) -> list[int]:
     """Return the steps that have a non-empty folder in the checkpoint folder, newest first."""
-    found = [entry for entry in folder.iterdir() if entry.name.isdigit() and (entry / _FINISHED).exists()]
+    found = [entry for entry in folder.iterdir() if entry.name.isdigit() and (entry / FINISHED).exists()]
     return sorted((int(entry.name) for entry in found), reverse=True)
-
-
-def any_step(workdir: Path) -> bool:
-    """Return whether a training has left a step's folder in `workdir`, be it damaged."""
-    recover(workdir)
-    folder = workdir / FOLDER
-    return folder.is_dir() and any(entry.name.isdigit() for entry in folder.iterdir())
 
 
 def locate(path: str | os.PathLike[str]) -> Path:
@@ -319,7 +80,7 @@ def locate(path: str | os.PathLike[str]) -> Path:
 def _stored_loss(step_folder: Path) -> float:
     """Return the validation loss that was saved with a step, infinite where there is none."""
     try:
-        return float(json.loads((step_folder / "metrics" / "metrics").read_text())[_METRIC])
+        return float(json.loads((step_folder / "metrics" / "metrics").read_text())[METRIC])
     except (OSError, ValueError, KeyError):
         return math.inf
 
@@ -331,15 +92,15 @@ def read_config(step_folder: Path) -> Config:
       InputError: it is unreadable, or of another version.
     """
     try:
-        about = _read_about(step_folder)
+        about = read_about(step_folder)
         return configuration.from_json(json.dumps(about["config"]))
     except InputError:
         raise
-    except _DAMAGE as error:
-        raise InputError(f"the checkpoint {step_folder} is damaged or none of ours ({_first(error)})") from error
+    except DAMAGE as error:
+        raise InputError(f"the checkpoint {step_folder} is damaged or none of ours ({first_line(error)})") from error
 
 
-def _read_about(step_folder: Path) -> dict[str, Any]:
+def read_about(step_folder: Path) -> dict[str, Any]:
     """Return what a step's checkpoint says about itself.
 
     Raises:
@@ -362,7 +123,7 @@ def _read_about(step_folder: Path) -> dict[str, Any]:
 
 def write_about(step_folder: Path, config: Config, model: Model) -> None:
     """Put another experiment into a copy of a step's folder, for `read_config`, with the checksums of its model."""
-    about = _about(config, {"model": checksum.of_arrays(model)})
+    about = about_itself(config, {"model": checksum.of_arrays(model)})
     files.write_text(step_folder / "about" / _JSON_FILE, json.dumps(about))
 
 
@@ -377,9 +138,7 @@ def trained(path: str | os.PathLike[str]) -> tuple[Model, Config, Path]:
     """
     folder = locate(path)
     config = read_config(folder)
-    template = state_template(build(config.image, config.model), config).model
-    here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    return read_model(folder, abstract(template, here)), config, folder
+    return read_model(folder, template(config).model), config, folder
 
 
 def read_model(step_folder: Path, template: Model) -> Model:
@@ -389,7 +148,7 @@ def read_model(step_folder: Path, template: Model) -> Model:
       InputError: it is damaged or its shapes are not those of `template`.
     """
     try:
-        checksum.check_stored(step_folder / "model", _read_about(step_folder).get("checksums", {}).get("model"))
+        checksum.check_stored(step_folder / "model", read_about(step_folder).get("checksums", {}).get("model"))
         # Orbax notices a wrong shape too, but late, and leaves half-done reads behind.
         stored = _shapes(ocp.StandardCheckpointHandler().metadata(step_folder / "model").tree)
         expected = _shapes(template)
@@ -400,9 +159,9 @@ def read_model(step_folder: Path, template: Model) -> Model:
             return reader.restore(step_folder / "model", args=ocp.args.StandardRestore(template))
     except InputError:
         raise
-    except _DAMAGE as error:
+    except DAMAGE as error:
         raise InputError(
-            f"the checkpoint {step_folder} is damaged or does not fit its own configuration ({_first(error)})"
+            f"the checkpoint {step_folder} is damaged or does not fit its own configuration ({first_line(error)})"
         ) from error
 
 

@@ -31,6 +31,7 @@ from mdnvo_jax.training.state import (
     schedule_scale,
     state_template,
 )
+from mdnvo_jax.training.store import Store, UnsavedError, any_step
 
 # Steps between two rows of TensorBoard.
 _LOG_EVERY = 10
@@ -108,7 +109,7 @@ def train(config: Config, workdir: Path, *, resume: bool = False) -> str:
     batches = training_batches(train_set, config, seed=config.training.seed, **share)
     steps_per_epoch = config.training.steps_per_epoch or batches_per_epoch(train_set, config)
     network = build(config.image, config.model)
-    store = checkpoint.Store(workdir, config.training.keep_latest)
+    store = Store(workdir, config.training.keep_latest)
     everywhere = parallel.replicated(mesh)
     if resume:
         restored = store.restore(checkpoint.abstract(state_template(network, config), everywhere))
@@ -132,7 +133,7 @@ def train(config: Config, workdir: Path, *, resume: bool = False) -> str:
 
 def _claim(workdir: Path, resume: bool) -> None:
     """Make `workdir`, or refuse: a training is neither overwritten nor resumed by accident."""
-    found = checkpoint.any_step(workdir)
+    found = any_step(workdir)
     if found and not resume:
         raise InputError(f"{workdir} holds checkpoints of a training: go on with --resume, or choose another --workdir")
     if resume and not found:
@@ -191,7 +192,7 @@ class _Run:
         workdir: Path,
         network: Network,
         mesh: jax.sharding.Mesh,
-        store: checkpoint.Store,
+        store: Store,
         steps_per_epoch: int,
         first_step: int,
     ) -> None:
@@ -301,7 +302,7 @@ class _Run:
         try:
             yield
         except OSError as error:
-            what = str(error) if isinstance(error, checkpoint.UnsavedError) else f"a log cannot be written ({error})"
+            what = str(error) if isinstance(error, UnsavedError) else f"a log cannot be written ({error})"
             if self.config.training.full_disk == "stop":
                 raise DiskError(f"{what}: make room and go on with --resume") from error
             print(f"warning: {what}: going on, as training.full_disk says", file=sys.stderr, flush=True)

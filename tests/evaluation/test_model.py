@@ -17,8 +17,8 @@ from mdnvo_jax.evaluation.compare import MeanStep
 from mdnvo_jax.mixture import Mixture
 from mdnvo_jax.model.head import Labels
 from mdnvo_jax.model.network import build
-from mdnvo_jax.training import checkpoint
 from mdnvo_jax.training.state import initial_state, initial_variables
+from mdnvo_jax.training.store import Store
 
 CONFIG = Config(
     image=ImageConfig(height=32, width=64, channels=1),
@@ -91,7 +91,7 @@ def workdir(tmp_path_factory):
     """An untrained model, saved as a training would."""
     folder = tmp_path_factory.mktemp("model")
     state = initial_state(initial_variables(build(CONFIG.image, CONFIG.model), CONFIG), CONFIG, LABELS)
-    store = checkpoint.Store(folder, keep_latest=1)
+    store = Store(folder, keep_latest=1)
     store.save(state, None, CONFIG, 1.0)
     store.close()
     return folder

@@ -18,6 +18,7 @@ from mdnvo_jax.model.head import Labels
 from mdnvo_jax.model.network import build
 from mdnvo_jax.training import checkpoint
 from mdnvo_jax.training.state import initial_state, initial_variables
+from mdnvo_jax.training.store import Store
 
 LABELS = Labels(np.array([0, 0, 1, 0, 0.01, 0]), np.array([0.02, 0.02, 0.5, 0.005, 0.02, 0.005]))
 
@@ -43,7 +44,7 @@ def save_model(folder, **data):
         data=DataConfig(window=3, **data),
     )
     state = initial_state(initial_variables(build(config.image, config.model), config), config, LABELS)
-    store = checkpoint.Store(folder, keep_latest=1)
+    store = Store(folder, keep_latest=1)
     store.save(state, {}, config, 1.0)
     store.close()
     return folder

@@ -20,6 +20,7 @@ from mdnvo_jax.model.network import build
 from mdnvo_jax.recalibration import SigmaScale
 from mdnvo_jax.training import checkpoint
 from mdnvo_jax.training.state import initial_state, initial_variables, state_template
+from mdnvo_jax.training.store import Store
 
 CONFIG = Config(
     image=ImageConfig(height=32, width=64, channels=1),
@@ -54,7 +55,7 @@ def saved(root, tmp_path_factory):
     folder = tmp_path_factory.mktemp("run")
     config = dataclasses.replace(CONFIG, data=dataclasses.replace(CONFIG.data, root=str(root)))
     state = initial_state(initial_variables(build(CONFIG.image, CONFIG.model), CONFIG), CONFIG, LABELS)
-    store = checkpoint.Store(folder, keep_latest=1)
+    store = Store(folder, keep_latest=1)
     store.save(state, {}, config, 1.0)
     store.close()
     return folder
@@ -254,7 +255,7 @@ def test_predict_can_do_without(workdir, root, tmp_path, monkeypatch):
 
 def test_the_training_goes_on_beside_the_file(workdir):
     recalibration.write(checkpoint.locate(workdir), some_scale())
-    store = checkpoint.Store(workdir, keep_latest=1)
+    store = Store(workdir, keep_latest=1)
     restored = store.restore(checkpoint.abstract(state_template(build(CONFIG.image, CONFIG.model), CONFIG)))
     # A better checkpoint takes the place of the old one, and the factors of the old weights go with them.
     store.save(restored.state._replace(step=restored.state.step + 5), {}, CONFIG, 0.5)

@@ -18,6 +18,7 @@ from mdnvo_jax.errors import InputError
 from mdnvo_jax.model.network import build
 from mdnvo_jax.training import checkpoint, checksum
 from mdnvo_jax.training.state import SKIPPED, State, initial_state, initial_variables, state_template
+from mdnvo_jax.training.store import Restored, Store, UnsavedError, any_step
 
 STEPS = (3, 6, 9)
 
@@ -37,7 +38,7 @@ def first_state() -> State:
 def saved(first_state: State, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The --workdir of a training with three checkpoints, the last of them the best."""
     workdir = tmp_path_factory.mktemp("saved")
-    store = checkpoint.Store(workdir, keep_latest=3)
+    store = Store(workdir, keep_latest=3)
     for step in STEPS:
         store.save(state_at(step, first_state), {"next_index": step}, CONFIG, 1.0 / step)
     store.close()
@@ -55,8 +56,8 @@ def template() -> State:
     )
 
 
-def restore(workdir: Path) -> checkpoint.Restored:
-    store = checkpoint.Store(workdir, keep_latest=3)
+def restore(workdir: Path) -> Restored:
+    store = Store(workdir, keep_latest=3)
     try:
         return store.restore(template())
     finally:
@@ -199,7 +200,7 @@ def test_every_bit_type_and_shape_counts() -> None:
 
 def test_a_step_that_was_lost_is_saved_again(workdir: Path, first_state: State) -> None:
     truncated(workdir / "checkpoints" / "9")
-    store = checkpoint.Store(workdir, keep_latest=3)
+    store = Store(workdir, keep_latest=3)
     store.restore(template())
     store.save(state_at(9, first_state), {"next_index": 9}, CONFIG, 0.1)
     store.close()
@@ -211,7 +212,7 @@ def test_a_step_that_was_lost_is_saved_again(workdir: Path, first_state: State) 
 
 
 def test_a_step_that_was_saved_before_its_validation_is_replaced(workdir: Path, first_state: State) -> None:
-    store = checkpoint.Store(workdir, keep_latest=3)
+    store = Store(workdir, keep_latest=3)
     store.save(state_at(9, first_state)._replace(epoch=jnp.asarray(1)), {"next_index": 9}, CONFIG, 0.01)
     store.close()
     assert int(restore(workdir).state.epoch) == 1
@@ -225,7 +226,7 @@ def test_a_kill_while_a_step_is_replaced_loses_nothing(workdir: Path, finished: 
     place = workdir / "replaced_checkpoint" / "9"
     place.parent.mkdir()
     (shutil.copytree if finished else shutil.move)(workdir / "checkpoints" / "9", place)
-    assert checkpoint.any_step(workdir)
+    assert any_step(workdir)
     assert not place.parent.exists()
     assert restore(workdir).step == 9
 
@@ -295,18 +296,18 @@ def test_a_full_disk_costs_the_checkpoint_that_did_not_fit_and_no_other(
 
     if not looks_first:
         # As where another program fills the disk in the middle of a save.
-        monkeypatch.setattr(checkpoint.Store, "_check_room", lambda *_: None)
-    store = checkpoint.Store(small_disk, keep_latest=2)
+        monkeypatch.setattr(Store, "_check_room", lambda *_: None)
+    store = Store(small_disk, keep_latest=2)
     store.save(padded(1, 30_000), {}, CONFIG)
     store.wait()
-    with pytest.raises(checkpoint.UnsavedError, match=r"No space left on device.*step 1 is the last whole one"):
+    with pytest.raises(UnsavedError, match=r"No space left on device.*step 1 is the last whole one"):
         store.save(padded(2, 300_000), {}, CONFIG)
         store.wait()
     assert {path.name for path in (small_disk / checkpoint.FOLDER).iterdir()} == {"1"}
     # What fits is saved again, and both can be read.
     store.save(padded(3, 1_000), {}, CONFIG)
     store.close()
-    again = checkpoint.Store(small_disk, keep_latest=2)
+    again = Store(small_disk, keep_latest=2)
     assert again.steps() == [3, 1]
     restored = again.restore(checkpoint.abstract(padded(3, 1_000)))
     again.close()

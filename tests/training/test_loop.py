@@ -19,6 +19,7 @@ from mdnvo_jax.model.network import build
 from mdnvo_jax.soak import training
 from mdnvo_jax.training import checkpoint, logs, loop, parallel
 from mdnvo_jax.training.state import SKIPPED, TRAIN_METRICS, State, make_plateau, state_template
+from mdnvo_jax.training.store import Store
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,7 @@ def finish(process: subprocess.Popen[str]) -> tuple[int, str, str]:
 
 def last_state(workdir: Path) -> State:
     config = from_json((workdir / "config.json").read_text())
-    store = checkpoint.Store(workdir, keep_latest=2)
+    store = Store(workdir, keep_latest=2)
     try:
         template = state_template(build(config.image, config.model), config)
         here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
