@@ -4,7 +4,6 @@ import dataclasses
 import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from typing import Any
 
 import jax
 import numpy as np
@@ -12,14 +11,13 @@ import numpy as np
 from mdnvo_jax import mixture, predictor
 from mdnvo_jax.benchmark import child, contest, material
 from mdnvo_jax.benchmark.growth import exponent
+from mdnvo_jax.benchmark.our_training import OurTraining
 from mdnvo_jax.benchmark.outcome import Outcome, Settings
 from mdnvo_jax.benchmark.timing import Contender, interleaved, spread
 from mdnvo_jax.config import Config
 from mdnvo_jax.evaluation.tables import Column, Row, Table
 from mdnvo_jax.mixture import Mixture
-from mdnvo_jax.model.network import build
 from mdnvo_jax.predictor import Predictor
-from mdnvo_jax.training import parallel, step
 
 _ROUNDS = 7
 _MULTIPLIER = 0.25
@@ -114,18 +112,8 @@ def _by_window(settings: Settings) -> dict[float, Contender]:
 def _training(config: Config, steps: int, devices: int) -> Contender:
     """Return what takes a training step on windows of `steps` steps."""
     config = dataclasses.replace(config, data=dataclasses.replace(config.data, window=steps))
-    mesh = parallel.make_mesh(config.training.batch_size, devices)
-    network = build(config.image, config.model)
-    take = parallel.compile_step(step.bind(step.train_step, network, config), mesh, donate=True)
-    batch = parallel.place(material.training_batch(config), mesh)
-    state = material.fresh_state(config, mesh)
-
-    def run() -> Any:
-        nonlocal state
-        state, metrics = take(state, batch)
-        return metrics
-
-    return run
+    ours = OurTraining(config, devices)
+    return ours.contender(ours.compiled(config))
 
 
 def _by_components(settings: Settings) -> dict[float, Contender]:

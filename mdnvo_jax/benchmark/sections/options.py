@@ -1,16 +1,14 @@
 """Section options: what the options that save memory save, and what they cost."""
 
 import dataclasses
-from collections.abc import Callable
 from typing import Any
 
 from mdnvo_jax.benchmark import material
+from mdnvo_jax.benchmark.our_training import OurTraining
 from mdnvo_jax.benchmark.outcome import Outcome, Settings, compared
 from mdnvo_jax.benchmark.timing import RATIO, interleaved
 from mdnvo_jax.config import Config
 from mdnvo_jax.evaluation.tables import Column, Row, Table, Value
-from mdnvo_jax.model.network import build
-from mdnvo_jax.training import parallel, step
 
 _ROUNDS = 7
 _BUDGET_S = 120.0
@@ -30,11 +28,12 @@ def measure(settings: Settings) -> Outcome:
     """Measure memory and time of a training step."""
     outcome = Outcome()
     config = material.small_config(32, 64, 1 / 32, batch=4) if settings.short else material.paper_config(96, 320, 0.25)
-    steps, held = {}, {}
+    ours, steps, held = OurTraining(config), {}, {}
     if settings.short:
         outcome.line("short form: a step without options alone, for each of them compiles for seconds")
     for name in [_PLAIN] if settings.short else _OPTIONS:
-        steps[name], held[name] = _compiled(_with(config, name))
+        compiled = ours.compiled(_with(config, name))
+        steps[name], held[name] = ours.contender(compiled), compiled.memory_analysis().temp_size_in_bytes
     found = interleaved(steps, settings.rounds(_ROUNDS), budget_s=_BUDGET_S)
     outcome.times(f"options {material.described(config)}", found)
     rows: list[Row] = [
@@ -69,22 +68,3 @@ def _with(config: Config, name: str) -> Config:
         model=dataclasses.replace(config.model, **model),
         training=dataclasses.replace(config.training, **training),
     )
-
-
-def _compiled(config: Config) -> tuple[Callable[[], Any], int]:
-    """Return what takes a training step, and the bytes that it holds in between."""
-    mesh = parallel.make_mesh(config.training.batch_size, 1, accumulate=config.training.accumulate)
-    network = build(config.image, config.model)
-    take = parallel.compile_step(step.bind(step.train_step, network, config), mesh, donate=True)
-    batch = parallel.place(material.training_batch(config), mesh)
-    state = material.fresh_state(config, mesh)
-    compiled = take.lower(state, batch).compile()
-
-    def run() -> Any:
-        nonlocal state
-        state, metrics = compiled(state, batch)
-        return metrics
-
-    memory = compiled.memory_analysis()
-    assert memory is not None, "every backend that is measured here plans its memory"
-    return run, memory.temp_size_in_bytes

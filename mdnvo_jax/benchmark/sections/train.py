@@ -9,13 +9,12 @@ import numpy as np
 
 from mdnvo_jax.benchmark import material, peers
 from mdnvo_jax.benchmark.agreement import agree, agree_all
+from mdnvo_jax.benchmark.our_training import OurTraining
 from mdnvo_jax.benchmark.outcome import Outcome, Settings, compared
 from mdnvo_jax.benchmark.timing import Contender, interleaved, rate, ratio, seconds
 from mdnvo_jax.config import Config
 from mdnvo_jax.evaluation.tables import Column, Row, Table, Value
 from mdnvo_jax.model.conv import LAYERS
-from mdnvo_jax.model.network import build
-from mdnvo_jax.training import parallel, step
 from mdnvo_jax.training.state import State
 
 _ROUNDS = 9
@@ -71,39 +70,10 @@ def measure(settings: Settings) -> Outcome:
     return outcome
 
 
-class _Ours:
-    """Our training: one state, stepped by whichever variant has its turn."""
-
-    def __init__(self, config: Config) -> None:
-        self.config = config
-        self.mesh = parallel.make_mesh(config.training.batch_size, 1)
-        self.batch = parallel.place(material.training_batch(config), self.mesh)
-        self.state = self.fresh()
-
-    def fresh(self) -> State:
-        """Return the state before the first step."""
-        return material.fresh_state(self.config, self.mesh)
-
-    def compiled(self, config: Config) -> Any:
-        """Return the compiled step of a variant."""
-        network = build(config.image, config.model)
-        function: Any = parallel.compile_step(step.bind(step.train_step, network, config), self.mesh, donate=True)
-        return function.lower(self.state, self.batch).compile()
-
-    def contender(self, function: Any) -> Contender:
-        """Return what takes one step with a compiled variant."""
-
-        def run() -> Any:
-            self.state, metrics = function(self.state, self.batch)
-            return self.state, metrics
-
-        return run
-
-
 def _one(config: Config, settings: Settings, outcome: Outcome, has_torch: bool) -> list[Row]:
     """Return the rows of one size."""
     size = material.described(config)
-    ours = _Ours(config)
+    ours = OurTraining(config)
     contenders: dict[str, Contender] = {}
     first: dict[str, float] = {}
     moments: dict[str, list[jax.Array]] = {}
@@ -157,7 +127,7 @@ def _is_adam(node: Any) -> bool:
 
 
 def _add_torch(
-    ours: _Ours,
+    ours: OurTraining,
     config: Config,
     settings: Settings,
     outcome: Outcome,
@@ -200,7 +170,7 @@ def _add_torch(
 
 
 def assert_same_step(
-    ours: _Ours, peer: Any, calm: Config, images: Any, steps: Any, outcome: Outcome
+    ours: OurTraining, peer: Any, calm: Config, images: Any, steps: Any, outcome: Outcome
 ) -> dict[str, float]:
     """Assert that one step without dropout finds the same loss, gradient, statistics and parameters on both sides.
 
