@@ -8,14 +8,11 @@ import tempfile
 import time
 from pathlib import Path
 
-import jax
-
 from mdnvo_jax.config import from_json
 from mdnvo_jax.errors import InputError
-from mdnvo_jax.model.network import build
 from mdnvo_jax.soak.tally import Tally
 from mdnvo_jax.training import checkpoint, checksum
-from mdnvo_jax.training.state import State, state_template
+from mdnvo_jax.training.state import State
 from mdnvo_jax.training.store import Restored, Store
 
 
@@ -28,9 +25,7 @@ def run(seconds: float, seed: int, workdir: Path) -> Tally:
       workdir: of a training with two checkpoints or more.
     """
     tally, draw = Tally("corruption"), random.Random(seed)
-    config = from_json((workdir / "config.json").read_text())
-    here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    template = checkpoint.abstract(state_template(build(config.image, config.model), config), here)
+    template = checkpoint.template(from_json((workdir / "config.json").read_text()))
     steps = checkpoint.steps_in(workdir / checkpoint.FOLDER)
     with tempfile.TemporaryDirectory() as folder:
         whole = {step: _digest(_restored(_only(workdir, step, Path(folder)), template)) for step in steps[:2]}

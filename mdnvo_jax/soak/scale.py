@@ -1,6 +1,5 @@
 """Trainings by several processes, one of which is killed: the others end in time, and any number goes on from there."""
 
-import csv
 import random
 import subprocess
 import tempfile
@@ -9,6 +8,7 @@ from pathlib import Path
 
 from mdnvo_jax.soak import training
 from mdnvo_jax.soak.tally import Tally
+from mdnvo_jax.training import logs
 
 # How many processes train, or go on; 1 is a training like any other.
 _COUNTS = (1, 2, 4)
@@ -31,7 +31,7 @@ def run(seconds: float, seed: int, config: Path, workdir: Path) -> Tally:
     """
     tally, draw = Tally("scale"), random.Random(seed)
     end = time.monotonic() + seconds
-    expected = _rows(workdir)
+    expected = logs.read_rows(workdir / logs.CSV)
     slowest, furthest = 0.0, 0.0
     while time.monotonic() < end or not tally.tried:
         tally.tried += 1
@@ -42,7 +42,7 @@ def run(seconds: float, seed: int, config: Path, workdir: Path) -> Tally:
             slowest = max(slowest, took)
             why = why or _go_on(config, Path(folder) / "run", then)
             if not why:
-                difference = _difference(_rows(Path(folder) / "run"), expected)
+                difference = _difference(logs.read_rows(Path(folder) / "run" / logs.CSV), expected)
                 furthest = max(furthest, difference)
                 why = f"losses differ by {difference:.1e} of theirs" if difference > _TOLERANCE else ""
             tally.lost += [f"{what}: {why}"] if why else []
@@ -56,37 +56,32 @@ def _lose_one(config: Path, workdir: Path, count: int, draw: random.Random) -> t
     time.sleep(draw.uniform(5, 25))
     draw.choice(processes).kill()
     killed = time.monotonic()
-    for process in processes:
-        try:
-            process.communicate(timeout=_WITHIN_S)
-        except subprocess.TimeoutExpired:
-            for other in processes:
-                other.kill()
-                other.communicate()
-            return _WITHIN_S, f"a process lived on for {_WITHIN_S} s after another was killed"
+    if not _ended(processes, _WITHIN_S):
+        return _WITHIN_S, f"a process lived on for {_WITHIN_S} s after another was killed"
     return time.monotonic() - killed, ""
 
 
 def _go_on(config: Path, workdir: Path, count: int) -> str:
     """Let `count` processes finish the training; return what was wrong, if anything."""
     processes = training.start_together(config, workdir, count)
-    for process in processes:
-        try:
-            _, errors = process.communicate(timeout=training.TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            for other in processes:
-                other.kill()
-                other.communicate()
-            return "did not come to an end"
+    said = _ended(processes, training.TIMEOUT_S)
+    if not said:
+        return "did not come to an end"
+    for process, errors in zip(processes, said, strict=True):
         if process.returncode:
             return f"exit {process.returncode}: {(errors.strip().splitlines() or [''])[-1][:200]}"
     return ""
 
 
-def _rows(workdir: Path) -> list[dict[str, str]]:
-    """Return the rows of a training's metrics."""
-    with (workdir / "metrics.csv").open(newline="", encoding="utf-8") as stream:
-        return list(csv.DictReader(stream))
+def _ended(processes: "list[subprocess.Popen[str]]", within_s: float) -> list[str]:
+    """Return what each process has said on stderr; nothing where one had to be killed, for it did not end in time."""
+    try:
+        return [process.communicate(timeout=within_s)[1] for process in processes]
+    except subprocess.TimeoutExpired:
+        for process in processes:
+            process.kill()
+            process.communicate()
+        return []
 
 
 def _difference(found: list[dict[str, str]], expected: list[dict[str, str]]) -> float:

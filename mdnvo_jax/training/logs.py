@@ -22,6 +22,7 @@ from tensorboardX.event_file_writer import EventsWriter
 from tensorboardX.proto import event_pb2, summary_pb2
 
 from mdnvo_jax import files
+from mdnvo_jax.training import processes
 
 CSV = "metrics.csv"
 # Seconds between two times that TensorBoard's file is brought to the disk.
@@ -165,7 +166,7 @@ class EpochProgress:
             rich.progress.TimeRemainingColumn(),
             "{task.fields[note]}",
             console=console,
-            disable=not (console.is_terminal and jax.process_index() == 0),
+            disable=not (console.is_terminal and processes.leads()),
         )
         self._task = self._bar.add_task(title, total=total, completed=start, rate="", note="")
 

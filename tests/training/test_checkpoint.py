@@ -17,7 +17,7 @@ from mdnvo_jax import predictor
 from mdnvo_jax.errors import InputError
 from mdnvo_jax.model.network import build
 from mdnvo_jax.training import checkpoint, checksum
-from mdnvo_jax.training.state import SKIPPED, State, initial_state, initial_variables, state_template
+from mdnvo_jax.training.state import SKIPPED, State, initial_state, initial_variables
 from mdnvo_jax.training.store import Restored, Store, UnsavedError, any_step
 
 STEPS = (3, 6, 9)
@@ -50,16 +50,10 @@ def workdir(saved: Path, tmp_path: Path) -> Path:
     return shutil.copytree(saved, tmp_path / "run")
 
 
-def template() -> State:
-    return checkpoint.abstract(
-        state_template(build(CONFIG.image, CONFIG.model), CONFIG), jax.sharding.SingleDeviceSharding(jax.devices()[0])
-    )
-
-
 def restore(workdir: Path) -> Restored:
     store = Store(workdir, keep_latest=3)
     try:
-        return store.restore(template())
+        return store.restore(checkpoint.template(CONFIG))
     finally:
         store.close()
 
@@ -201,7 +195,7 @@ def test_every_bit_type_and_shape_counts() -> None:
 def test_a_step_that_was_lost_is_saved_again(workdir: Path, first_state: State) -> None:
     truncated(workdir / "checkpoints" / "9")
     store = Store(workdir, keep_latest=3)
-    store.restore(template())
+    store.restore(checkpoint.template(CONFIG))
     store.save(state_at(9, first_state), {"next_index": 9}, CONFIG, 0.1)
     store.close()
     assert restore(workdir).step == 9
