@@ -214,8 +214,8 @@ class _Run:
             for epoch in range(int(state.epoch), self.config.training.epochs):
                 state, stopped = self.steps(state, batches, epoch, stop)
                 if stopped:
+                    self.keep(state, batches)
                     with self.writing():
-                        self.store.save(state, batches.get_state(), self.config)
                         self.store.wait()
                     # Of several processes, one that was not asked stops with the one that was.
                     number = stop.signal or signal.SIGTERM
@@ -226,11 +226,7 @@ class _Run:
                 # be missing for good.
                 with self.writing():
                     self.logs.epoch(row)
-                # By itself, so that one that could not be written does not keep this one from being tried.
-                with self.writing():
-                    self.store.wait()
-                with self.writing():
-                    self.store.save(state, batches.get_state(), self.config, row["validation_loss"])
+                self.keep(state, batches, row["validation_loss"])
                 best = min(best, row["validation_loss"])
                 if processes.leads():
                     print(_epoch_line(row), flush=True)
@@ -291,6 +287,14 @@ class _Run:
         if number % _LOG_EVERY == 0:
             with self.writing():
                 self.logs.scalars(number, {f"step/{name}": float(value) for name, value in metrics.items()})
+
+    def keep(self, state: State, batches: Any, validation_loss: float = math.inf) -> None:
+        """Save a checkpoint, in the background."""
+        # By itself, so that one that could not be written does not keep this one from being tried.
+        with self.writing():
+            self.store.wait()
+        with self.writing():
+            self.store.save(state, batches.get_state(), self.config, validation_loss)
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[None]:

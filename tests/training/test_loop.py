@@ -15,10 +15,9 @@ import pytest
 from mdnvo_jax import train
 from mdnvo_jax.config import Config, TrainingConfig, from_json
 from mdnvo_jax.errors import exit_code
-from mdnvo_jax.model.network import build
 from mdnvo_jax.soak import training
 from mdnvo_jax.training import checkpoint, logs, loop, parallel
-from mdnvo_jax.training.state import SKIPPED, TRAIN_METRICS, State, make_plateau, state_template
+from mdnvo_jax.training.state import SKIPPED, TRAIN_METRICS, State, make_plateau
 from mdnvo_jax.training.store import Store
 
 
@@ -42,9 +41,7 @@ def last_state(workdir: Path) -> State:
     config = from_json((workdir / "config.json").read_text())
     store = Store(workdir, keep_latest=2)
     try:
-        template = state_template(build(config.image, config.model), config)
-        here = jax.sharding.SingleDeviceSharding(jax.devices()[0])
-        return store.restore(checkpoint.abstract(template, here)).state
+        return store.restore(checkpoint.template(config)).state
     finally:
         store.close()
 
