@@ -8,6 +8,9 @@ from pathlib import Path
 
 from mdnvo_jax.errors import InputError
 
+# Larger numbers in a file are no metres, pixels or seconds; their squares would not be finite.
+LARGEST_NUMBER = 1e100
+
 
 @contextlib.contextmanager
 def whole_file(path: str | os.PathLike[str]) -> Iterator[Path]:

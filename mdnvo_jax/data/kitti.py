@@ -12,11 +12,10 @@ import numpy as np
 from mdnvo_jax.data import images
 from mdnvo_jax.data.sequence import Camera, Sequence, one_size, rigid
 from mdnvo_jax.errors import InputError
+from mdnvo_jax.files import LARGEST_NUMBER
 
 # Equatorial radius of the WGS 84 ellipsoid, m.
 _EARTH_RADIUS_M = 6378137.0
-# Larger numbers are no metres, pixels or seconds; their squares would not be finite.
-_LARGEST = 1e100
 # How far R R^T may be from the identity: the seven digits of the files leave 1e-6, a transposition or a wrong column 1.
 _ROTATION_TOLERANCE = 1e-3
 
@@ -317,7 +316,7 @@ def _row(text: str, count: int, where: str) -> np.ndarray:
         values = np.array([float(word) for word in words])
     except ValueError as error:
         raise InputError(f"{where}: {error}: expected {count} numbers") from error
-    if not (np.abs(values) <= _LARGEST).all():
+    if not (np.abs(values) <= LARGEST_NUMBER).all():
         raise InputError(f"{where}: not every number is finite")
     return values
 

@@ -25,6 +25,7 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from mdnvo_jax.errors import InputError
+from mdnvo_jax.files import LARGEST_NUMBER
 
 if TYPE_CHECKING:
     from mdnvo_jax.mixture import Coupling, Mixture
@@ -38,8 +39,6 @@ _KITTI, _INDEXED, _SUMMARY = "trajectory_kitti.txt", "trajectory_kitti_indexed.t
 _COLUMNS: dict[Format, int] = {"kitti": 12, "indexed": 13, "tum": 8, "euroc": 8}
 _BY_COLUMNS: dict[int, Format] = {12: "kitti", 13: "indexed", 8: "tum"}
 _FORMAT_HINT = f"say what it is with --format ({', '.join(FORMATS)})"
-# Larger numbers are no metres or seconds; their squares would not be finite.
-_LARGEST = 1e100
 # What a rotation or a unit quaternion may be off by: files with three decimals pass, Sim(3) matrices do not.
 _ROTATION_TOLERANCE = 1e-2
 _NANOSECONDS = 1e-9
@@ -207,7 +206,7 @@ def _numbers(path: Path, line: int, text: str, count: int, described: str, *, mo
         if not _NUMBER.fullmatch(entry):
             raise InputError(f"{path}, line {line}: {entry[:40]!r} is no number; expected {described}")
     values = [float(entry) for entry in entries[:count]]
-    if not (np.abs(values) <= _LARGEST).all():
+    if not (np.abs(values) <= LARGEST_NUMBER).all():
         raise InputError(f"{path}, line {line}: a number that is not finite; expected {described}")
     return values
 
