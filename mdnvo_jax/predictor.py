@@ -1,6 +1,5 @@
 """A trained model, and what it makes of frames: offline over windows, or streaming frame by frame."""
 
-import contextlib
 import dataclasses
 import functools
 import os
@@ -18,8 +17,8 @@ import numpy as np
 from mdnvo_jax import backend as backends
 from mdnvo_jax import offline, recalibration, weights
 from mdnvo_jax.backend import Backend, Precision
-from mdnvo_jax.config import Config, ImageConfig
-from mdnvo_jax.data import ahead, checks, images
+from mdnvo_jax.config import Config
+from mdnvo_jax.data import ahead, checks
 from mdnvo_jax.data.folder import as_sequence
 from mdnvo_jax.data.sequence import Sequence
 from mdnvo_jax.errors import InputError
@@ -37,9 +36,6 @@ from mdnvo_jax.watch import watched
 Mode = Literal["offline", "streaming"]
 # Frames whose results are not waited for while streaming from files.
 _STEPS_AHEAD = 2
-# From this share of the network's input on, what a lens does not see is warned of. KITTI's cameras leave 4.5 % at most
-# of each other.
-_UNCOVERED = 0.05
 
 
 class Predictor(NamedTuple):
@@ -283,8 +279,7 @@ def predict(
     hop = max(1, window // 2) if hop is None else hop
     if not 1 <= hop <= window:
         raise InputError(f"hop is {hop}: expected 1 to {window}, the steps in a window")
-    _warn_of_uncovered(sequence, predictor.config.image)
-    if line := checks.of_rate(sequence, checks.trained_s(predictor.config.data)):
+    for line in checks.before_prediction(sequence, predictor.config):
         print(f"warning: {line}", file=sys.stderr)
     size = offline.PAIRS if mode == "offline" else 1
     began = time.perf_counter()
@@ -325,29 +320,6 @@ def predict(
         "ms_per_frame": {stage: round(1e3 * total / sequence.count, 3) for stage, total in seconds.items()},
     }
     return dataclasses.replace(result, about=about)
-
-
-def _warn_of_uncovered(sequence: Sequence, image_config: ImageConfig) -> None:
-    """Say on stderr how much of the training's view the frames do not show, if that is much."""
-    if sequence.camera is None:
-        return
-    size = _frame_size(sequence)
-    share = images.uncovered(size, sequence.camera, image_config) if size else 0.0
-    if share >= _UNCOVERED:
-        print(
-            f"warning: {sequence.name} does not show {100 * share:.0f} % of what the training's camera sees: the edge "
-            "of the frames is repeated there, and the trajectory may be worse for it",
-            file=sys.stderr,
-        )
-
-
-def _frame_size(sequence: Sequence) -> tuple[int, int] | None:
-    """Return height and width of the first frame that can be read."""
-    for index in range(sequence.count):
-        with contextlib.suppress(InputError):
-            height, width = sequence.read(index).shape[:2]
-            return height, width
-    return None
 
 
 def _trained_height(config: Config) -> str:

@@ -1,13 +1,16 @@
 """What is odd about the data of a training, or of a prediction beside it: said, and left as it is."""
 
+import contextlib
 from collections.abc import Sequence as Many
 from typing import NamedTuple
 
 import numpy as np
 
-from mdnvo_jax.config import DataConfig
+from mdnvo_jax.config import Config, DataConfig, ImageConfig
+from mdnvo_jax.data import images
 from mdnvo_jax.data.sequence import Sequence
 from mdnvo_jax.data.world.motion import FRAME_S
+from mdnvo_jax.errors import InputError
 
 # Steps on either side that one is compared with.
 _NEIGHBOURS = 2
@@ -19,6 +22,9 @@ _LEAST_RAD = np.deg2rad(3.0)
 _DEVIATION = 1.4826
 # Frame rates whose ratio is beyond this, or below its inverse, are told apart.
 _SAME_RATE = 1.4
+# From this share of the network's input on, what a lens does not see is said. KITTI's cameras leave 4.5 % at most of
+# each other.
+_UNCOVERED = 0.05
 
 
 class Jump(NamedTuple):
@@ -93,3 +99,32 @@ def of_rate(sequence: Sequence, step_s: float) -> str:
         f"{sequence.name}: {1 / here_s:.3g} frames a second where the training had {1 / step_s:.3g}: steps are "
         f"{'shorter' if here_s < step_s else 'longer'} than those it learnt from{advice}"
     )
+
+
+def of_view(sequence: Sequence, image_config: ImageConfig) -> str:
+    """Return a line where frames do not show much of the training's view; empty where they do, or nobody knows."""
+    if sequence.camera is None:
+        return ""
+    size = _frame_size(sequence)
+    share = images.uncovered(size, sequence.camera, image_config) if size else 0.0
+    if share < _UNCOVERED:
+        return ""
+    return (
+        f"{sequence.name} does not show {100 * share:.0f} % of what the training's camera sees: the edge of the frames "
+        "is repeated there, and the trajectory may be worse for it"
+    )
+
+
+def before_prediction(sequence: Sequence, config: Config) -> list[str]:
+    """Return what is to be said of a sequence that a network of the experiment `config` is to see."""
+    lines = of_view(sequence, config.image), of_rate(sequence, trained_s(config.data))
+    return [line for line in lines if line]
+
+
+def _frame_size(sequence: Sequence) -> tuple[int, int] | None:
+    """Return height and width of the first frame that can be read."""
+    for index in range(sequence.count):
+        with contextlib.suppress(InputError):
+            height, width = sequence.read(index).shape[:2]
+            return height, width
+    return None
