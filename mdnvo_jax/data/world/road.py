@@ -182,8 +182,11 @@ def _ordinary_corners(style: Style, s: np.ndarray) -> _Corners:
 
 
 def _winding_corners(style: Style, s: np.ndarray) -> _Corners:
-    """Return corner after corner, at speeds where lateral acceleration and yaw rate both are near what a car does."""
-    pitch = 25.0
+    """Return corner after corner, at every speed and as sharp as lateral acceleration and yaw rate then allow.
+
+    Quick corners are wide ones: were all of them slow, a network would learn that who turns is slow.
+    """
+    pitch = 18.0 + 2.0 * style.cruise_mps
     place, stop, draw = _places(style, s, pitch)
     share = np.where(stop, style.bends * draw[:, 3], 0.75 + 0.25 * draw[:, 3])
     # Left and right by turns: so many sharp corners to one side would lead the road across itself.
@@ -192,8 +195,8 @@ def _winding_corners(style: Style, s: np.ndarray) -> _Corners:
         place=place,
         stop=stop,
         pause=1 + 5 * draw[:, 7],
-        target=np.minimum(style.cruise_mps, 3.5 + 4 * draw[:, 2]),
-        hold=np.full(len(place), 8.0),
+        target=np.minimum(style.cruise_mps, 3.5 + 10 * draw[:, 2]),
+        hold=np.full(len(place), 0.3 * pitch),
         share=side * share,
         # The ramps at both ends of a corner take as much of its angle again.
         turn=1.6 * np.deg2rad(60 + 50 * draw[:, 6]),
