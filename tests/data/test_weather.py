@@ -52,7 +52,8 @@ def test_cameras_vary_and_their_poses_are_where_they_are():
     # One metre up, along the upright of a car that leans a little.
     np.testing.assert_allclose(low.poses[:, 1, 3] - high.poses[:, 1, 3], 1.0, atol=0.02)
     np.testing.assert_array_equal(low.poses[:, :3, :3], high.poses[:, :3, :3])
-    depth = [synthetic.truth(3, 2, 0, **SIZE, camera_height_m=(h, h)).depth[-1].mean() for h in (1.2, 2.2)]
+    straight = first_seed(lambda s: not s.winding)
+    depth = [synthetic.truth(straight, 2, 0, **SIZE, camera_height_m=(h, h)).depth[-1].mean() for h in (1.2, 2.2)]
     assert depth[1] / depth[0] == pytest.approx(2.2 / 1.2, rel=0.05)
     with pytest.raises(InputError, match="camera_height_m 2 to 1"):
         synthetic.drive(0, 2, **SIZE, camera_height_m=(2, 1))

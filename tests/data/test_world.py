@@ -71,8 +71,12 @@ def test_road_coordinates_undo_place(paths):
         eye = whole.poses[40, :3, 3]
         found_s, found_d, _ = undo(np.float32(x - eye[0]), np.float32(z - eye[2]), frame.lane)
         near = np.hypot(x - eye[0], z - eye[2]) < 90
-        # On the inside of corners of 7.5 m, a node's length along the middle is a third of that 5 m beside it.
+        # On the inside of corners of 7.5 m, a node's length along the middle is a third of that 5 m beside it, and
+        # from a third of the way to their centre on, the road before and behind the corner is as near.
         tolerance = 0.3 if whole.style.winding else 0.02
+        ahead = np.rint((s + BEHIND_M) / NODE_M).astype(int) + np.arange(-6, 7)[:, None]
+        near &= np.abs(whole.road.curvature[ahead]).max(0) * np.abs(d) < 0.35
+        assert near.sum() > 300
         np.testing.assert_allclose(found_s[near], s[near], atol=tolerance)
         np.testing.assert_allclose(found_d[near], d[near], atol=tolerance)
 
@@ -94,6 +98,19 @@ def test_speed_and_turns_stay_within_what_a_car_does(paths):
         assert np.abs(np.diff(speed) / (0.1 * FRAME_S)).max() <= style.acceleration_mps2 + 1e-3
         assert (road.speed**2 * np.abs(road.curvature)).max() <= LATERAL_MPS2
         assert (road.speed * np.abs(road.curvature)).max() <= YAW_RATE_RADPS
+
+
+def test_sharp_turns_are_driven_at_every_speed_that_bears_them():
+    """At 1.5 to 2.5 degrees a frame, from a crawl to the 12 m/s of the lateral limit: turning tells no speed."""
+    speeds = []
+    for seed in range(300):
+        if draw_style(seed).winding:
+            poses = world.path(seed, 100)[2]
+            step = geometry.matrix_to_step(geometry.inverse(poses[:-1]) @ poses[1:])
+            rate = np.abs(np.rad2deg(step[:, 4]))
+            speeds.append(np.linalg.norm(step[:, :3], axis=1)[(rate > 1.5) & (rate < 2.5)] / FRAME_S)
+    low, middle, high = np.quantile(np.concatenate(speeds), [0.05, 0.5, 0.95])
+    assert low < 4.5 and 6 < middle < 9 and high > 10.5
 
 
 def test_speeds_are_flat_and_standing_still_is_among_them(paths):
