@@ -32,6 +32,8 @@ Products = Literal["float32", "mixed"]
 _COLUMNS_FROM_PIXELS = 256
 # Values in the columns of one product, at most: what stays near the processor's caches.
 _COLUMNS_VALUES = 2**21
+# Such products in a turn of the loop that adds them, where there are more than so many.
+_UNROLLED, _WORTH_UNROLLING = 4, 64
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2, 3, 4))
@@ -171,5 +173,7 @@ def _kernel_gradient(g: Array, x: Array, shape: tuple[int, ...], stride: int, pa
         cotangent = lax.bitcast_convert_type(lax.dynamic_index_in_dim(g, index, keepdims=False), kind)
         return total + lax.dot(columns, cotangent, preferred_element_type=total.dtype), None
 
-    total, _ = lax.scan(add_band, total, jnp.arange(images * bands), unroll=4)
+    # What is unrolled takes longer to compile, which a short sum does not win back.
+    unroll = _UNROLLED if images * bands > _WORTH_UNROLLING else 1
+    total, _ = lax.scan(add_band, total, jnp.arange(images * bands), unroll=unroll)
     return total.reshape(shape)
