@@ -10,7 +10,7 @@ from pathlib import Path
 from mdnvo_jax import files
 from mdnvo_jax.errors import InputError, Parser, exit_code
 
-SECTIONS = ("train", "predict", "mixture", "input", "start", "growth", "lstm", "options")
+SECTIONS = ("train", "predict", "mixture", "input", "start", "growth", "lstm", "options", "scaling")
 
 
 def main(arguments: Sequence[str]) -> None:

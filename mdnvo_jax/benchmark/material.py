@@ -119,6 +119,20 @@ def training_batch(config: Config) -> dict[str, np.ndarray]:
     return {"images": frames, "steps": steps.astype(np.float32), "mask": np.ones((batch, window), bool)}
 
 
+def moving_batch(config: Config, number: int) -> dict[str, np.ndarray]:
+    """Return batch `number` of windows in which the picture moves once, twice or three times as far, as labels say."""
+    image, batch, window = config.image, config.training.batch_size, config.data.window
+    read = frame_reader(image.channels, (image.height, image.width))
+    rng = np.random.default_rng(number)
+    strides = rng.integers(1, 4, (batch, window))
+    first = rng.integers(0, 64, (batch, 1))
+    at = np.concatenate([first, first + np.cumsum(strides, 1)], axis=1)
+    steps = np.tile(_MEAN, (batch, window, 1))
+    steps[..., 2] += _STD[2] * (strides - 2)
+    frames = np.stack([np.stack([read(int(index)) for index in row]) for row in at])
+    return {"images": frames, "steps": steps, "mask": np.ones((batch, window), bool)}
+
+
 def fresh_variables(network: Network, config: Config) -> Variables:
     """Return variables of Xavier's distribution, as training starts from; drawn by NumPy, which is faster at it."""
     rng = np.random.default_rng(0)
