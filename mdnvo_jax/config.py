@@ -145,6 +145,8 @@ class TrainingConfig:
     accumulate: int = 1
     # Paper: about 40 epochs.
     epochs: int = 40
+    # Epochs in a row without a better validation loss after which training ends; 0: it goes on to the last epoch.
+    early_stop_patience: int = 0
     # Steps in an epoch; 0 means once through the training windows.
     steps_per_epoch: int = 0
     # "sgd": plain stochastic gradient descent, to compare with.

@@ -35,6 +35,8 @@ from mdnvo_jax.training.store import Store, UnsavedError, any_step
 
 # Steps between two rows of TensorBoard.
 _LOG_EVERY = 10
+# Fields of the training that a run may have otherwise than the one it goes on from.
+_MAY_CHANGE = ("epochs", "early_stop_patience", "full_disk")
 
 
 class NonFiniteError(RuntimeError):
@@ -162,7 +164,7 @@ def _check_same(config: Config, workdir: Path) -> None:
     """Refuse to resume with another configuration than the training began with, but for what may change."""
     before = dataclasses.asdict(configuration.from_json((workdir / "config.json").read_text()))
     now = dataclasses.asdict(config)
-    for name in ("epochs", "full_disk"):
+    for name in _MAY_CHANGE:
         before["training"][name] = now["training"][name]
     # Older releases did not look at it.
     before["data"]["interval_s"] = before["data"]["interval_s"] or now["data"]["interval_s"]
@@ -170,7 +172,7 @@ def _check_same(config: Config, workdir: Path) -> None:
     if different:
         raise InputError(
             f"{', '.join(different)} differ from {workdir / 'config.json'}: resume with the same configuration "
-            "(only training.epochs and training.full_disk may change), or train in another --workdir"
+            f"(only {', '.join(f'training.{name}' for name in _MAY_CHANGE)} may change), or train in another --workdir"
         )
 
 
@@ -209,9 +211,13 @@ class _Run:
     def epochs(self, state: State, batches: Any, validation: Any) -> str:
         """Run from where `state` is to the last epoch, or to a signal."""
         started = time.monotonic()
-        best = min((float(row["validation_loss"]) for row in logs.read_rows(self.workdir / logs.CSV)), default=math.inf)
+        past = [row for row in logs.read_rows(self.workdir / logs.CSV) if int(row["step"]) <= self.first_step]
+        losses = [float(row["validation_loss"]) for row in past]
+        patience = self.config.training.early_stop_patience
         with StopRequest().listening() as stop:
             for epoch in range(int(state.epoch), self.config.training.epochs):
+                if processes.all_agree(_is_stale(losses, patience)):
+                    break
                 state, stopped = self.steps(state, batches, epoch, stop)
                 if stopped:
                     self.keep(state, batches)
@@ -227,7 +233,7 @@ class _Run:
                 with self.writing():
                     self.logs.epoch(row)
                 self.keep(state, batches, row["validation_loss"])
-                best = min(best, row["validation_loss"])
+                losses.append(row["validation_loss"])
                 if processes.leads():
                     print(_epoch_line(row), flush=True)
         with self.writing():
@@ -236,10 +242,11 @@ class _Run:
             raise DiskError(f"the training is at its end, step {int(state.step)}, which could not be saved")
         steps = int(state.step) - self.first_step
         seconds = time.monotonic() - started
+        early = f", {patience} of them without a better one" if int(state.epoch) < self.config.training.epochs else ""
         rate = f"{steps / seconds:.2f} steps/s, validation included" if steps else "nothing was left to do"
         return (
-            f"trained {self.config.training.epochs} epochs, {steps} steps in this run, in {seconds:.0f} s ({rate}); "
-            f"best validation loss {best:.4f}; everything is in {self.workdir}"
+            f"trained {int(state.epoch)} epochs{early}, {steps} steps in this run, in {seconds:.0f} s ({rate}); "
+            f"best validation loss {min(losses, default=math.inf):.4f}; everything is in {self.workdir}"
         )
 
     def steps(self, state: State, batches: Any, epoch: int, stop: StopRequest) -> tuple[State, bool]:
@@ -330,6 +337,11 @@ class _Run:
         if not math.isfinite(row["validation_loss"]):
             raise NonFiniteError(f"the validation loss is {row['validation_loss']} at step {row['step']}")
         return self.end_epoch(state, sums), row
+
+
+def _is_stale(losses: list[float], patience: int) -> bool:
+    """Return whether none of the last `patience` validation losses is below all those before; never where it is 0."""
+    return 0 < patience < len(losses) and min(losses[-patience:]) >= min(losses[:-patience])
 
 
 def _epoch_line(row: dict[str, float]) -> str:

@@ -1,6 +1,7 @@
 """The loop with real processes, files and signals: what it leaves, and that stopping it changes nothing."""
 
 import csv
+import dataclasses
 import json
 import signal
 import subprocess
@@ -13,7 +14,7 @@ import numpy as np
 import pytest
 
 from mdnvo_jax import train
-from mdnvo_jax.config import Config, TrainingConfig, from_json
+from mdnvo_jax.config import Config, TrainingConfig, from_json, load_config
 from mdnvo_jax.errors import exit_code
 from mdnvo_jax.soak import training
 from mdnvo_jax.training import checkpoint, logs, loop, parallel
@@ -217,6 +218,25 @@ def test_a_training_that_diverges_stops_and_keeps_its_last_checkpoint(config_fil
     np.testing.assert_array_equal(
         before.model.params["head"]["kernel"], last_state(tmp_path).model.params["head"]["kernel"]
     )
+
+
+def test_a_training_that_gets_no_better_ends_early(config_file: Path, tmp_path: Path) -> None:
+    config = load_config(str(config_file))
+    config = dataclasses.replace(
+        config, training=dataclasses.replace(config.training, epochs=40, early_stop_patience=2)
+    )
+    said = loop.train(config, tmp_path)
+    losses = [float(row["validation_loss"]) for row in rows(tmp_path)]
+    # The best is the third but last, and nothing before it was followed by two that are no better.
+    assert len(losses) < 40 and min(losses) == losses[-3]
+    assert all(min(losses[end - 2 : end]) < min(losses[: end - 2]) for end in range(3, len(losses)))
+    assert said.startswith(f"trained {len(losses)} epochs, 2 of them without a better one, ")
+    assert f"best validation loss {min(losses):.4f}" in said
+    assert "nothing was left to do" in loop.train(config, tmp_path, resume=True)
+    longer = dataclasses.replace(
+        config, training=dataclasses.replace(config.training, epochs=len(losses) + 1, early_stop_patience=0)
+    )
+    assert " 11 steps in this run" in loop.train(longer, tmp_path, resume=True)
 
 
 def idle_run(workdir: Path, limit: int) -> loop._Run:
