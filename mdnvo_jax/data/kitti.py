@@ -261,8 +261,10 @@ def _offset_of(projection: np.ndarray) -> np.ndarray:
     offset = np.eye(4)
     try:
         offset[:3, 3] = -np.linalg.solve(projection[:, :3], projection[:, 3])
-    except np.linalg.LinAlgError as error:
-        raise InputError(f"calibration: {projection[:, :3].tolist()} is no matrix of a camera's intrinsics") from error
+    except np.linalg.LinAlgError:
+        offset[:3, 3] = np.inf
+    if not (np.abs(offset) <= LARGEST_NUMBER).all():
+        raise InputError(f"calibration: {projection[:, :3].tolist()} is no matrix of a camera's intrinsics")
     return offset
 
 

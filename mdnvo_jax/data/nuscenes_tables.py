@@ -163,6 +163,8 @@ def rows(path: Path, fields: tuple[str, str, *tuple[str, ...]]) -> Iterator[tupl
             between = _BETWEEN_ROWS.match(text, at)
             at = between.end() if between else at
             if text[at : at + 1] == "]":
+                if (text[at + 1 :] + _more(file, path)).strip():
+                    raise _malformed(path, line, text[: at + 1], "something comes after the last row")
                 return
             try:
                 row, end = decode(text, at)
@@ -210,6 +212,8 @@ def _scenes(path: Path) -> dict[str, SceneRow]:
     for row in map(SceneRow._make, rows(path, SceneRow._fields)):
         if scenes.setdefault(row.name, row) != row:
             raise InputError(f"{path} has two scenes {row.name}: expected each name once")
+    if not scenes:
+        raise InputError(f"{path} has no scene: unpack the metadata again")
     return scenes
 
 
@@ -259,7 +263,7 @@ def _images(
         except (TypeError, ValueError, OverflowError) as error:
             raise InputError(f"{path}, token {token}: {error}: expected timestamp, height and width") from error
         if not 0 <= found.time_us <= _LATEST_US:
-            raise InputError(f"{path}, token {token}: timestamp {found.time_us:.3g}: expected microseconds since 1970")
+            raise InputError(f"{path}, token {token}: timestamp {str(time_us)[:40]}: expected microseconds since 1970")
         if "\0" in file or ".." in PurePath(file).parts or PurePath(file).is_absolute():
             # Such a name would lead to files that nobody meant to show.
             raise InputError(

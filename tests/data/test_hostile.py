@@ -4,6 +4,7 @@ import ast
 import json
 import os
 import pickle
+import re
 import struct
 import zlib
 from collections.abc import Callable
@@ -12,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from nuscenes_fixture import VERSION, Spec, write_nuscenes
 from PIL import Image
@@ -260,6 +261,8 @@ def test_any_file_of_times_is_read_or_refused(data: bytes, tmp_path: Path) -> No
     .map(lambda rows: "\n".join(f"P{i}: {row}" for i, row in enumerate(rows)))
     .map(str.encode)
 )
+# Its offset from camera 0 is beyond all numbers.
+@example(data=b"P0: 1 0 0 0 0 1 0 0 0 0 1 0\nP1: 2.2e-311 0 0 1 0 1 0 1 0 0 1 1")
 @quickly
 def test_any_calibration_is_read_or_refused(data: bytes, tmp_path: Path) -> None:
     folder = tmp_path / "sequences" / "00"
@@ -332,6 +335,29 @@ def test_any_table_is_read_or_refused(name: str, tables: Path) -> None:
 
     try:
         check()
+    finally:
+        path.write_text(whole)
+
+
+@pytest.mark.parametrize(
+    ("name", "damage", "message"),
+    [
+        ("scene", lambda whole: "[]", r"scene\.json has no scene"),
+        ("scene", lambda whole: "[]" + whole[1:], r"scene\.json, line 1: something comes after the last row"),
+        (
+            "sample_data",
+            lambda whole: re.sub(r'("timestamp": )\d+', rf"\g<1>{'9' * 400}", whole),
+            r"timestamp 9{40}: exp",
+        ),
+    ],
+)
+def test_tables_that_fuzzing_found(name: str, damage: Callable[[str], str], message: str, tables: Path) -> None:
+    path = tables / VERSION / f"{name}.json"
+    whole = path.read_text()
+    try:
+        path.write_text(damage(whole))
+        with pytest.raises(InputError, match=message):
+            nuscenes.read_nuscenes(tables, "scene-0001", version=VERSION)
     finally:
         path.write_text(whole)
 
