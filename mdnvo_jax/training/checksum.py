@@ -45,7 +45,7 @@ def check_stored(folder: Path, expected: Mapping[str, str] | None) -> None:
       ChecksumError: an array differs, or is missing, or was not saved, or there is none at all; it names the first.
       ValueError: an array cannot be read.
     """
-    store = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{folder.absolute()}/"}}
+    store = {"driver": "ocdbt", "base": {"driver": "file", "path": f"{folder.resolve()}/"}}
     context = ts.Context()
     found = {}
     for key in ts.KvStore.open(store, context=context).result().list().result():

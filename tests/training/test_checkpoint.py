@@ -178,6 +178,17 @@ def test_prediction_refuses_damaged_weights(workdir: Path, damage) -> None:
     assert predictor.load(workdir / "checkpoints" / "6").source.endswith("6")
 
 
+@pytest.mark.parametrize("folder", ["../beside/run", "./run", "../gr\u00fcn run"])
+def test_a_checkpoint_may_have_any_name_and_be_named_from_anywhere(
+    workdir: Path, folder: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    here = tmp_path / "here"
+    here.mkdir()
+    shutil.copytree(workdir, here / folder)
+    monkeypatch.chdir(here)
+    assert predictor.load(folder).source.endswith("9")
+
+
 def test_the_checksum_names_the_array_that_differs(workdir: Path) -> None:
     other_parameters(workdir / "checkpoints" / "9")
     with pytest.raises(InputError, match=r"ChecksumError: params\.head\.bias is not what was saved"):
