@@ -25,8 +25,8 @@ Optimiser = Literal["adam", "sgd"]
 
 # Steps whose losses are compared, and steps that are timed after as many that are not.
 _COMPARED, _FIRST, _TIMED, _WARM_UP = 100, 10, 30, 3
-# By optimiser: the rates that losses are compared at.
-_RATES: dict[Optimiser, float] = {"sgd": 1e-3, "adam": 1e-4}
+# Optimisers and rates that losses are compared at: the faster a network learns, the faster rounding grows.
+_COMPARED_AT: tuple[tuple[Optimiser, float], ...] = (("sgd", 1e-4), ("sgd", 1e-3), ("adam", 3e-5), ("adam", 1e-4))
 _LOST_AFTER_S = 60
 
 
@@ -58,7 +58,7 @@ def measure(settings: Settings) -> Outcome:
     outcome = Outcome()
     if settings.short:
         outcome.line("short form: one process and a few steps alone")
-        found = _run(_ALONE._replace(batch=4), "adam", 3, short=True)
+        found = _run(_ALONE._replace(batch=4), 3, short=True)
         outcome.times("scaling, toy", {"1 process": found["seconds"]})
         return outcome
     outcome.tables += [_agreement(outcome), _costs(settings, outcome)]
@@ -68,11 +68,12 @@ def measure(settings: Settings) -> Outcome:
 def _agreement(outcome: Outcome) -> Table:
     """Return how far the losses of a training are from those of one process with the same batches."""
     rows: list[Row] = []
-    for optimiser, learning_rate in _RATES.items():
-        expected = np.array(_run(_ALONE, optimiser, _COMPARED)["losses"])
+    for optimiser, learning_rate in _COMPARED_AT:
+        at = {"optimiser": optimiser, "learning_rate": learning_rate}
+        expected = np.array(_run(_ALONE, _COMPARED, compared_at=at)["losses"])
         for shared in (Arrangement(devices=4), Arrangement(processes=2), Arrangement(processes=4)):
-            away = np.abs(np.array(_run(shared, optimiser, _COMPARED)["losses"]) / expected - 1)
-            outcome.agreement[f"loss, {optimiser}, {_named(shared)}"] = float(away.max())
+            away = np.abs(np.array(_run(shared, _COMPARED, compared_at=at)["losses"]) / expected - 1)
+            outcome.agreement[f"loss, {optimiser} at {learning_rate:g}, {_named(shared)}"] = float(away.max())
             rows.append(
                 {
                     "optimiser": f"{optimiser}, rate {learning_rate:g}",
@@ -89,7 +90,7 @@ def _agreement(outcome: Outcome) -> Table:
         Column("first", f"largest relative difference, first {_FIRST} steps"),
         Column("all", f"all {_COMPARED}"),
     ]
-    config = _config("adam", 8, short=False, compared=True)
+    config = _config(8, short=False, compared_at={})
     notes = [
         f"{material.described(config)}, global batch 8 x window {config.data.window}, float32, dropout on, the same "
         "batches for all; sums over a batch are taken in another order, and training makes more of that step by step."
@@ -112,7 +113,7 @@ def _costs(settings: Settings, outcome: Outcome) -> Table:
     rows: list[Row] = []
     alone = 0.0
     for what, shared in arrangements.items():
-        seconds = _run(shared, "adam", _WARM_UP + (settings.repeats or _TIMED), compared=False)["seconds"][_WARM_UP:]
+        seconds = _run(shared, _WARM_UP + (settings.repeats or _TIMED))["seconds"][_WARM_UP:]
         outcome.times("scaling", {f"{what}: {_named(shared)}, batch {shared.batch}": seconds})
         windows = rate(seconds, shared.batch)
         alone = alone or windows.value
@@ -136,7 +137,7 @@ def _costs(settings: Settings, outcome: Outcome) -> Table:
         Column("efficiency", "windows/s a core, over the first row's", 2),
         Column("n", "steps"),
     ]
-    config = _config("adam", 8, short=False, compared=False)
+    config = _config(8, short=False, compared_at=None)
     notes = [
         f"{material.described(config)}, window {config.data.window}, Adam. Processes are kept on a core each, in turn, "
         "and meet over loopback (gloo); input is not part of a step."
@@ -151,14 +152,20 @@ def _named(shared: Arrangement) -> str:
 
 
 def _run(
-    shared: Arrangement, optimiser: Optimiser, steps: int, *, short: bool = False, compared: bool = True
+    shared: Arrangement, steps: int, *, short: bool = False, compared_at: dict[str, Any] | None = None
 ) -> dict[str, list[float]]:
-    """Return losses and seconds of the steps of a training, as process 0 of those that share it saw them."""
+    """Return losses and seconds of the steps of a training, as process 0 of those that share it saw them.
+
+    Args:
+      shared: who shares it.
+      steps: how many.
+      short: of a toy.
+      compared_at: fields of the training where losses are compared, which is done on a smaller network.
+    """
     with socket.socket() as probe:
         probe.bind(("localhost", 0))
         port = probe.getsockname()[1]
-    asked = {**shared._asdict(), "port": port, "optimiser": optimiser, "steps": steps}
-    asked |= {"short": short, "compared": compared}
+    asked = {**shared._asdict(), "port": port, "steps": steps, "short": short, "compared_at": compared_at}
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={shared.devices}"
     workers = [
         child.start(["-m", __name__, json.dumps({**asked, "process": number})], {"XLA_FLAGS": flags})
@@ -173,14 +180,14 @@ def _run(
     return found
 
 
-def _config(optimiser: Optimiser, batch: int, *, short: bool, compared: bool) -> Config:
-    """Return what is trained: a network of toy size where losses are compared, else that of configs/kitti_small.py."""
+def _config(batch: int, *, short: bool, compared_at: dict[str, Any] | None) -> Config:
+    """Return what is trained: a toy, a small network where losses are compared, else that of configs/kitti_small.py."""
     if short:
-        config = material.small_config(32, 64, 1 / 32, batch=batch)
-    else:
-        config = material.small_config(*((32, 64, 1 / 16) if compared else (80, 256, 0.25)), batch=batch)
-    training = dataclasses.replace(config.training, optimiser=optimiser, learning_rate=_RATES[optimiser])
-    return dataclasses.replace(config, training=training)
+        return material.small_config(32, 64, 1 / 32, batch=batch)
+    if compared_at is None:
+        return material.small_config(batch=batch)
+    config = material.small_config(32, 64, 1 / 16, batch=batch)
+    return dataclasses.replace(config, training=dataclasses.replace(config.training, **compared_at))
 
 
 def _work(asked: dict[str, Any]) -> dict[str, list[float]]:
@@ -194,7 +201,7 @@ def _work(asked: dict[str, Any]) -> dict[str, list[float]]:
     if shared.processes == 1:
         together = dict.fromkeys(together)
     processes.join(argparse.Namespace(**together, cluster=False, lost_after=_LOST_AFTER_S))
-    config = _config(asked["optimiser"], shared.batch, short=asked["short"], compared=asked["compared"])
+    config = _config(shared.batch, short=asked["short"], compared_at=asked["compared_at"])
     mesh = parallel.make_mesh(shared.batch)
     state = material.fresh_state(config, mesh)
     take = parallel.compile_step(
