@@ -6,8 +6,11 @@
 
 Frames of any camera with known intrinsics are brought to one virtual camera: 82 degrees across, as KITTI's, without the
 upper third of the sky. What each choice is worth at a small budget is in BENCHMARKS.md (`bin/ablate` on
-`configs/ablation.py`). The weights that ship today came of two sittings on 800 worlds; what this file gives is better
-on rendered drives and reads sharp turns as too slow on real ones: BENCHMARKS.md says why.
+`configs/ablation.py`). The weights that ship had two sittings: this file, 24 epochs from scratch, on worlds whose
+winding roads were driven slowly; then, on the worlds as they are now,
+
+    python -m mdnvo_jax.train configs/pretrained.py --workdir runs/second --data.cache CACHE \\
+        --training.initial_weights shipped --training.learning_rate 5e-4 --training.epochs 20
 """
 
 from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig, TrainingConfig

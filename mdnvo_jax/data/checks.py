@@ -9,7 +9,6 @@ import numpy as np
 from mdnvo_jax.config import Config, DataConfig, ImageConfig
 from mdnvo_jax.data import images
 from mdnvo_jax.data.sequence import Sequence
-from mdnvo_jax.data.world.motion import FRAME_S
 from mdnvo_jax.errors import InputError
 
 # Steps on either side that one is compared with.
@@ -79,8 +78,7 @@ def interval_s(sequences: Many[Sequence]) -> float:
 
 def trained_s(config: DataConfig) -> float:
     """Return the shortest time of a step that a training saw; 0 where it is not known."""
-    rendered_s = FRAME_S if config.dataset == "synthetic" else 0.0
-    return (config.interval_s or rendered_s) * min(config.strides)
+    return config.interval_s * min(config.strides)
 
 
 def of_rate(sequence: Sequence, step_s: float) -> str:

@@ -79,5 +79,4 @@ def test_where_no_rate_is_known_nothing_is_said(toy) -> None:
     assert checks.interval_s([untimed]) == 0
     assert checks.of_rate(untimed, 0.1) == checks.of_rate(toy(20), 0.0) == ""
     assert checks.trained_s(DataConfig(interval_s=0.08, strides=(2, 3))) == pytest.approx(0.16)
-    assert checks.trained_s(DataConfig(dataset="synthetic")) == pytest.approx(0.1)
     assert checks.trained_s(DataConfig()) == 0

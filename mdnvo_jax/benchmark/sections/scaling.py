@@ -57,11 +57,10 @@ def measure(settings: Settings) -> Outcome:
     """Compare the losses of several processes with those of one, and time weak and strong scaling."""
     outcome = Outcome()
     if settings.short:
-        outcome.line("short form: one process and a few steps alone")
-        found = _run(_ALONE._replace(batch=4), 3, short=True)
-        outcome.times("scaling, toy", {"1 process": found["seconds"]})
-        return outcome
-    outcome.tables += [_agreement(outcome), _costs(settings, outcome)]
+        outcome.line("short form: one process alone, for every other one compiles for seconds")
+    else:
+        outcome.tables.append(_agreement(outcome))
+    outcome.tables.append(_costs(settings, outcome))
     return outcome
 
 
@@ -110,10 +109,13 @@ def _costs(settings: Settings, outcome: Outcome) -> Table:
         "strong, twice as many as cores": Arrangement(processes=2 * cores),
         "weak, twice as many as cores": Arrangement(processes=2 * cores, batch=16 * cores),
     }
+    if settings.short:
+        arrangements = {"one process": _ALONE}
+    steps = _WARM_UP + settings.rounds(_TIMED)
     rows: list[Row] = []
     alone = 0.0
     for what, shared in arrangements.items():
-        seconds = _run(shared, _WARM_UP + (settings.repeats or _TIMED))["seconds"][_WARM_UP:]
+        seconds = _run(shared, steps, short=settings.short)["seconds"][_WARM_UP:]
         outcome.times("scaling", {f"{what}: {_named(shared)}, batch {shared.batch}": seconds})
         windows = rate(seconds, shared.batch)
         alone = alone or windows.value
@@ -137,7 +139,7 @@ def _costs(settings: Settings, outcome: Outcome) -> Table:
         Column("efficiency", "windows/s a core, over the first row's", 2),
         Column("n", "steps"),
     ]
-    config = _config(8, short=False, compared_at=None)
+    config = _config(8, short=settings.short, compared_at=None)
     notes = [
         f"{material.described(config)}, window {config.data.window}, Adam. Processes are kept on a core each, in turn, "
         "and meet over loopback (gloo); input is not part of a step."
