@@ -7,7 +7,8 @@
 Frames of any camera with known intrinsics are brought to one virtual camera: 82 degrees across, as KITTI's, without the
 upper third of the sky. What each choice is worth at a small budget is in BENCHMARKS.md (`bin/ablate` on
 `configs/ablation.py`). The weights that ship had two sittings: this file, 24 epochs from scratch, on worlds whose
-winding roads were driven slowly; then, on the worlds as they are now,
+winding roads were driven slowly; then, on the worlds as they are now and from the first sitting's weights, which
+`bin/ship_weights` had put into a copy of the repository,
 
     python -m mdnvo_jax.train configs/pretrained.py --workdir runs/second --data.cache CACHE \\
         --training.initial_weights shipped --training.learning_rate 5e-4 --training.epochs 20
