@@ -6,6 +6,7 @@ import math
 import os
 import shutil
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -26,6 +27,8 @@ DAMAGED = "damaged_checkpoints"
 _REPLACED = "replaced_checkpoint"
 # What a step's folder is called until it is whole.
 _UNFINISHED = ".orbax-checkpoint-tmp"
+# How often, and for how long at most, it is looked whether such a folder stays away once removed.
+_LOOKS, _LOOK_EVERY_S, _REMOVE_WITHIN_S = 5, 0.02, 2.0
 
 
 class UnsavedError(OSError):
@@ -219,8 +222,7 @@ class Store:
             yield
         except (OSError, ValueError) as error:
             if jax.process_count() == 1:
-                for left in (self._workdir / FOLDER).glob(f"*{_UNFINISHED}*"):
-                    shutil.rmtree(left, ignore_errors=True)
+                _remove_unfinished(self._workdir / FOLDER)
             steps = self.steps()
             whole = f"step {steps[0]} is the last whole one" if steps else "there is none yet"
             full = os.strerror(errno.ENOSPC)
@@ -244,6 +246,21 @@ def recover(workdir: Path) -> None:
             old.rename(new)
     if (workdir / _REPLACED).is_dir():
         (workdir / _REPLACED).rmdir()
+
+
+def _remove_unfinished(folder: Path) -> None:
+    """Remove what is left of a checkpoint that could not be written.
+
+    Orbax gives up at the first error and does not wait for its other writes, which may still bring a folder back: it is
+    gone when it stays away. What is there after all is removed when the training is opened again.
+    """
+    deadline, absent = time.monotonic() + _REMOVE_WITHIN_S, 0
+    while absent < _LOOKS and time.monotonic() < deadline:
+        found = list(folder.glob(f"*{_UNFINISHED}*"))
+        for left in found:
+            shutil.rmtree(left, ignore_errors=True)
+        absent = 0 if found else absent + 1
+        time.sleep(_LOOK_EVERY_S)
 
 
 def any_step(workdir: Path) -> bool:
