@@ -23,6 +23,11 @@ def start(arguments: Sequence[str], environment: Mapping[str, str] | None = None
     return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, cwd=here, env=variables)
 
 
+def virtual_devices(count: int) -> dict[str, str]:
+    """Return the variables with which a process has so many devices on this processor."""
+    return {"XLA_FLAGS": f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={count}"}
+
+
 def printed(process: subprocess.Popen[str]) -> str:
     """Return what a process of `start` has printed when it has ended.
 

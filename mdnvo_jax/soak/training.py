@@ -2,7 +2,6 @@
 
 import json
 import os
-import socket
 import subprocess
 import sys
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from mdnvo_jax.training import checkpoint, checksum
+from mdnvo_jax.training import checkpoint, checksum, processes
 from mdnvo_jax.training.store import any_step
 
 CONFIG = """
@@ -63,9 +62,7 @@ def start_together(config: Path, workdir: Path, count: int, *options: str) -> li
     """Start the training by `count` processes that meet over loopback, or go on with it; one is not told of others."""
     if count == 1:
         return [start(config, workdir, *options)]
-    with socket.socket() as probe:
-        probe.bind(("localhost", 0))
-        together = ["--coordinator", f"localhost:{probe.getsockname()[1]}", "--processes", str(count)]
+    together = ["--coordinator", processes.loopback(), "--processes", str(count)]
     return [start(config, workdir, *together, "--process", str(number), *options) for number in range(count)]
 
 

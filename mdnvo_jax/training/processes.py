@@ -8,6 +8,7 @@ checkpoint, and says what is to be said. They need a file system that all of the
 import argparse
 import contextlib
 import os
+import socket
 import sys
 from collections.abc import Callable, Iterator
 
@@ -50,6 +51,13 @@ def join(options: argparse.Namespace) -> None:
     except (RuntimeError, ValueError) as error:
         what = "no cluster that JAX knows" if options.cluster else f"the processes cannot meet at {options.coordinator}"
         raise InputError(f"{what}: {str(error).splitlines()[0]}") from error
+
+
+def loopback() -> str:
+    """Return an address at which processes of this host can meet: a port that is free now."""
+    with socket.socket() as probe:
+        probe.bind(("localhost", 0))
+        return f"localhost:{probe.getsockname()[1]}"
 
 
 def leads() -> bool:

@@ -1,13 +1,14 @@
 """Files that are damaged, made up or hostile: each is read, or refused in one line; nothing hangs, grows or is run."""
 
 import ast
+import contextlib
 import json
 import os
 import pickle
 import re
 import struct
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import cv2
@@ -293,6 +294,16 @@ def tables(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return root
 
 
+@contextlib.contextmanager
+def put_back(path: Path) -> Iterator[str]:
+    """Give the text of a table, which the table has again in the end."""
+    whole = path.read_text()
+    try:
+        yield whole
+    finally:
+        path.write_text(whole)
+
+
 def deep(levels: int) -> str:
     return "[" * levels + "]" * levels
 
@@ -333,10 +344,8 @@ def test_any_table_is_read_or_refused(name: str, tables: Path) -> None:
                 assert np.isfinite(sequence.poses).all()
         in_one_line(lambda: nuscenes.scenes(tables, VERSION))
 
-    try:
+    with put_back(path):
         check()
-    finally:
-        path.write_text(whole)
 
 
 @pytest.mark.parametrize(
@@ -353,27 +362,21 @@ def test_any_table_is_read_or_refused(name: str, tables: Path) -> None:
 )
 def test_tables_that_fuzzing_found(name: str, damage: Callable[[str], str], message: str, tables: Path) -> None:
     path = tables / VERSION / f"{name}.json"
-    whole = path.read_text()
-    try:
+    with put_back(path) as whole:
         path.write_text(damage(whole))
         with pytest.raises(InputError, match=message):
             nuscenes.read_nuscenes(tables, "scene-0001", version=VERSION)
-    finally:
-        path.write_text(whole)
 
 
 @pytest.mark.parametrize("file", ["../outside.jpg", "samples/../../outside.jpg", "/etc/hostname"])
 def test_a_name_in_a_table_does_not_lead_out_of_the_data_set(tables: Path, file: str) -> None:
     path = tables / VERSION / "sample_data.json"
-    whole = path.read_text()
-    rows = json.loads(whole)
-    next(row for row in rows if "CAM_FRONT" in row["filename"])["filename"] = file
-    try:
+    with put_back(path) as whole:
+        rows = json.loads(whole)
+        next(row for row in rows if "CAM_FRONT" in row["filename"])["filename"] = file
         path.write_text(json.dumps(rows))
         with pytest.raises(InputError, match=r"filename .*: expected a path below the data set's root"):
             nuscenes.read_nuscenes(tables, "scene-0001", version=VERSION)
-    finally:
-        path.write_text(whole)
 
 
 # Video

@@ -1,7 +1,6 @@
 """Section growth: what our costs are proportional to."""
 
 import dataclasses
-import os
 import sys
 from collections.abc import Callable, Mapping, Sequence
 
@@ -133,8 +132,8 @@ def _by_components(settings: Settings) -> dict[float, Contender]:
 
 def _with_devices(count: int) -> list[float]:
     """Return the seconds of training steps split over virtual devices, measured in a process that has so many."""
-    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={count}"
-    printed = child.run(["-m", "mdnvo_jax.benchmark.sections.growth", str(count)], {"XLA_FLAGS": flags})
+    environment = child.virtual_devices(count)
+    printed = child.run(["-m", "mdnvo_jax.benchmark.sections.growth", str(count)], environment)
     return [float(word) for word in printed.split()]
 
 

@@ -4,10 +4,9 @@ import argparse
 import dataclasses
 import json
 import os
-import socket
 import sys
 import time
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -21,12 +20,10 @@ from mdnvo_jax.evaluation.tables import Column, Row, Table, Value
 from mdnvo_jax.model.network import build
 from mdnvo_jax.training import parallel, processes, step
 
-Optimiser = Literal["adam", "sgd"]
-
 # Steps whose losses are compared, and steps that are timed after as many that are not.
 _COMPARED, _FIRST, _TIMED, _WARM_UP = 100, 10, 30, 3
 # Optimisers and rates that losses are compared at: the faster a network learns, the faster rounding grows.
-_COMPARED_AT: tuple[tuple[Optimiser, float], ...] = (("sgd", 1e-4), ("sgd", 1e-3), ("adam", 3e-5), ("adam", 1e-4))
+_COMPARED_AT = (("sgd", 1e-4), ("sgd", 1e-3), ("adam", 3e-5), ("adam", 1e-4))
 _LOST_AFTER_S = 60
 
 
@@ -164,13 +161,15 @@ def _run(
       short: of a toy.
       compared_at: fields of the training where losses are compared, which is done on a smaller network.
     """
-    with socket.socket() as probe:
-        probe.bind(("localhost", 0))
-        port = probe.getsockname()[1]
-    asked = {**shared._asdict(), "port": port, "steps": steps, "short": short, "compared_at": compared_at}
-    flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={shared.devices}"
+    asked = {
+        **shared._asdict(),
+        "address": processes.loopback(),
+        "steps": steps,
+        "short": short,
+        "compared_at": compared_at,
+    }
     workers = [
-        child.start(["-m", __name__, json.dumps({**asked, "process": number})], {"XLA_FLAGS": flags})
+        child.start(["-m", __name__, json.dumps({**asked, "process": number})], child.virtual_devices(shared.devices))
         for number in range(shared.processes)
     ]
     try:
@@ -199,7 +198,7 @@ def _work(asked: dict[str, Any]) -> dict[str, list[float]]:
         cores = sorted(os.sched_getaffinity(0))
         several = shared.processes > 1
         os.sched_setaffinity(0, [cores[asked["process"] % len(cores)]] if several else cores[: shared.cores])
-    together = {"coordinator": f"localhost:{asked['port']}", "processes": shared.processes, "process": asked["process"]}
+    together = {"coordinator": asked["address"], "processes": shared.processes, "process": asked["process"]}
     if shared.processes == 1:
         together = dict.fromkeys(together)
     processes.join(argparse.Namespace(**together, cluster=False, lost_after=_LOST_AFTER_S))
