@@ -1,10 +1,12 @@
 """Augmentation of windows: what is seen changes, and the labels change exactly with it."""
 
+import math
 import statistics
 
 import cv2
 import numpy as np
 
+from mdnvo_jax import geometry
 from mdnvo_jax.data import images
 from mdnvo_jax.data.sequence import Camera
 from mdnvo_jax.model.conv import FLOW_STRIDE
@@ -21,6 +23,13 @@ _OFFSET = 12.0
 _NOISE = 4.0
 # Largest shares of a frame that a narrower view lacks at its top, bottom, left and right.
 _NARROW = (0.3, 0.12, 0.25, 0.25)
+# Attitude of a swaying camera about x, y and z (pitch, yaw, roll), as standard deviations: what stays the same over a
+# window, what grows with every frame, and the strength of what swings, each in degrees. The swing is of the size of the
+# rendered cars' own and of any frequency up to half the frame rate: no spring's alone.
+_SWAY_OFFSET_DEG = (0.6, 0.6, 0.4)
+_SWAY_RATE_DEG = (0.0, 0.25, 0.0)
+_SWAY_SWING_DEG = (0.2, 0.15, 0.2)
+_SWAY_SINES = 5
 # Rows and columns by which the noise of one frame may be moved against that of another.
 _NOISE_SHIFT = 64
 # 256 values that are equally likely under the standard normal distribution: a byte draws one of them, at a tenth of
@@ -67,9 +76,84 @@ def narrow(frames: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     """
     height, width = frames.shape[1:3]
     top, bottom, left, right = (rng.random() * share for share in _NARROW)
-    rows = np.clip(np.arange(height), round(top * height), round((1 - bottom) * height) - 1)
-    columns = np.clip(np.arange(width), round(left * width), round((1 - right) * width) - 1)
-    return frames[:, rows][:, :, columns]
+    return _window_on(frames, round(top * height), round(bottom * height), round(left * width), round(right * width))
+
+
+def draw_sway(count: int, rng: np.random.Generator) -> np.ndarray:
+    """Return rotations `[count, 3, 3]` of a camera against its mount, one for each frame of a window, a few degrees."""
+    frame = np.arange(count) - (count - 1) / 2
+    frequency, phase = rng.uniform(0, 0.5, (2, _SWAY_SINES, 3)) * np.array([1, 4 * np.pi])[:, None, None]
+    swing = np.sqrt(2 / _SWAY_SINES) * np.sin(2 * np.pi * frequency * frame[:, None, None] + phase).sum(1)
+    offset, rate, strength = rng.standard_normal((3, 3)) * (_SWAY_OFFSET_DEG, _SWAY_RATE_DEG, _SWAY_SWING_DEG)
+    return geometry.exp_so3(np.deg2rad(offset + rate * frame[:, None] + strength * swing))
+
+
+def sway_frames(frames: np.ndarray, camera: Camera, rotations: np.ndarray) -> np.ndarray:
+    """Return a window of frames, uint8 `[T+1, H, W, C]`, as the same camera sees them when it is turned.
+
+    With K of `camera` and R of the frame, pixel x of the result shows pixel `K R K^-1 x`: exact whatever the depth, for
+    the camera turns about its own centre. What some frame does not see repeats the edge in all frames alike, as in
+    `narrow`.
+
+    Args:
+      frames: of `camera`.
+      camera: fx, fy, cx, cy of the frames.
+      rotations: attitude of the turned camera in the axes of the other, `[T+1, 3, 3]`.
+    """
+    height, width = frames.shape[1:3]
+    maps = _homographies(camera, rotations)
+    v, u = np.mgrid[:height, :width].astype(float)
+    edge = (u == 0) | (u == width - 1) | (v == 0) | (v == height - 1)
+    seen = _through(maps[:, None], np.stack([u[edge], v[edge]], -1))
+    over = (-seen[..., 1], seen[..., 1] - (height - 1), -seen[..., 0], seen[..., 0] - (width - 1))
+    sides = (v[edge] == 0, v[edge] == height - 1, u[edge] == 0, u[edge] == width - 1)
+    missing = [max(0, math.ceil(excess[:, side].max())) for excess, side in zip(over, sides, strict=True)]
+    turned = [
+        cv2.warpPerspective(
+            frame,
+            homography,
+            (width, height),
+            flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
+            borderMode=cv2.BORDER_REPLICATE,
+        ).reshape(frame.shape)
+        for frame, homography in zip(frames, maps, strict=True)
+    ]
+    return _window_on(np.stack(turned), *missing)
+
+
+def sway_flow(flow: np.ndarray, camera: Camera, rotations: np.ndarray) -> np.ndarray:
+    """Return the optical flow `[T, h, w, 2]` of swaying frames, on the network's map: `sway_frames`'s labels.
+
+    The place that a cell sees is found in the frame as it was, its flow there is that of the four cells about it, and
+    where it leads is brought to the next turned frame. NaN where one of the four is not known or not on the map.
+    """
+    height, width = flow.shape[1:3]
+    fx, fy, cx, cy = (value / FLOW_STRIDE for value in camera)
+    maps = _homographies((fx, fy, cx, cy), rotations)
+    v, u = np.mgrid[:height, :width].astype(float)
+    cells = np.stack([u, v], -1)
+    source = _through(maps[:-1, None, None], cells)
+    corner = np.floor(source)
+    share = source - corner
+    column, row = np.moveaxis(corner.astype(int), -1, 0)
+    step = np.arange(len(flow))[:, None, None]
+    blended = np.zeros(flow.shape)
+    for down in (0, 1):
+        for right in (0, 1):
+            weight = abs(1 - right - share[..., 0]) * abs(1 - down - share[..., 1])
+            inside = (row + down >= 0) & (row + down < height) & (column + right >= 0) & (column + right < width)
+            value = flow[step, np.clip(row + down, 0, height - 1), np.clip(column + right, 0, width - 1)]
+            value = np.where(inside[..., None], value, np.nan)
+            blended += np.where(weight[..., None] > 0, weight[..., None] * value, 0)
+    return (_through(np.linalg.inv(maps[1:])[:, None, None], source + blended) - cells).astype(flow.dtype)
+
+
+def sway_steps(steps: np.ndarray, rotations: np.ndarray) -> np.ndarray:
+    """Return the steps `[T, 6]` of the swaying camera: `R_t^T T_{t,t+1} R_{t+1}` of those of the other."""
+    turns = np.tile(np.eye(4), (len(rotations), 1, 1))
+    turns[:, :3, :3] = rotations
+    moved = geometry.compose(geometry.inverse(turns[:-1]), geometry.step_to_matrix(steps))
+    return geometry.matrix_to_step(geometry.compose(moved, turns[1:]))
 
 
 def photometric(frames: np.ndarray, strength: float, rng: np.random.Generator) -> np.ndarray:
@@ -97,3 +181,24 @@ def photometric(frames: np.ndarray, strength: float, rng: np.random.Generator) -
         toned = cv2.LUT(frame, tone[None]).reshape(frame.shape)
         result[index] = cv2.add(toned, moved, dtype=cv2.CV_8U).reshape(frame.shape)
     return result
+
+
+def _window_on(frames: np.ndarray, top: int, bottom: int, left: int, right: int) -> np.ndarray:
+    """Return frames `[..., H, W, C]` without so many of their rows and columns, the edge repeated in their place."""
+    height, width = frames.shape[-3:-1]
+    rows = np.clip(np.arange(height), top, height - bottom - 1)
+    columns = np.clip(np.arange(width), left, width - right - 1)
+    return frames[..., rows, :, :][..., columns, :]
+
+
+def _homographies(camera: Camera, rotations: np.ndarray) -> np.ndarray:
+    """Return `K R K^-1`, `[..., 3, 3]`: from pixels of the turned camera to those of the other."""
+    fx, fy, cx, cy = camera
+    intrinsics = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])
+    return intrinsics @ rotations @ np.linalg.inv(intrinsics)
+
+
+def _through(homography: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Return where homographies `[..., 3, 3]` take points `[..., 2]`."""
+    moved = homography[..., :2] @ points[..., None] + homography[..., 2:]
+    return moved[..., :2, 0] / moved[..., 2:, 0]

@@ -138,7 +138,8 @@ def label_statistics(sequences: Many[Sequence], data_config: DataConfig) -> tupl
     """Return mean and standard deviation of the labels that training sees, each `[6]` float64, m and rad.
 
     Every training window counts the same, with the lengths, strides, mirroring and reversal of `data_config` by their
-    chances, exactly rather than by sampling. The deviation is at least `STD_FLOOR`. For the mean step of the drives
+    chances, exactly rather than by sampling; what a swaying camera adds is left out. The deviation is at least
+    `STD_FLOOR`. For the mean step of the drives
     themselves (the constant predictor), give a `data_config` with `reverse` and `mirror` 0.
 
     Raises:
@@ -267,10 +268,16 @@ def _training_window(
         flow = np.full((steps, *flow_size(config.image), 2), np.nan, np.float32)
         if sequence.flow is not None and window.stride == 1 and not reverse:
             flow = np.stack([sequence.flow(int(index)) for index in indices[:-1]])
+    camera = cameras[0]
+    if camera is not None and data.sway > 0 and rng.random() < data.sway:
+        rotations = augment.draw_sway(steps + 1, rng)
+        frames = list(augment.sway_frames(np.stack(frames), camera, rotations))
+        labels = augment.sway_steps(labels, rotations)
+        flow = None if flow is None else augment.sway_flow(flow, camera, rotations)
     if mirror:
-        frames = [augment.mirror_frame(frame, camera) for frame, camera in zip(frames, cameras, strict=True)]
+        frames = [augment.mirror_frame(frame, own) for frame, own in zip(frames, cameras, strict=True)]
         labels = geometry.mirror_step(labels)
-        flow = None if flow is None else augment.mirror_flow(flow, cameras[0])
+        flow = None if flow is None else augment.mirror_flow(flow, camera)
     if rng.random() < data.narrow:
         frames = list(augment.narrow(np.stack(frames), rng))
     if data.photometric > 0:

@@ -3,7 +3,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mdnvo_jax.data.augment import mirror_flow, mirror_frame, narrow, photometric
+from mdnvo_jax import geometry
+from mdnvo_jax.data import synthetic
+from mdnvo_jax.data.augment import (
+    draw_sway,
+    mirror_flow,
+    mirror_frame,
+    narrow,
+    photometric,
+    sway_flow,
+    sway_frames,
+    sway_steps,
+)
 
 
 def blobs(camera, size, points):
@@ -152,3 +163,109 @@ def test_a_narrower_view_repeats_its_edge_in_all_frames_alike():
         seen.append((top, 39 - bottom, left, 59 - right))
     # Up to 30 % above, 12 % below, 25 % on either side.
     assert (np.max(seen, axis=0) <= (12, 5, 15, 15)).all() and (np.max(seen, axis=0) >= (8, 3, 10, 10)).all()
+
+
+# A swaying camera
+
+CAMERA = (100.0, 95.0, 60.0, 30.0)
+
+
+def rotations(*attitudes_deg):
+    return geometry.exp_so3(np.deg2rad(np.array(attitudes_deg)))
+
+
+def test_a_swaying_camera_sees_what_a_turned_one_would():
+    """Points keep their place in the world, so the turned camera has them at R^T p."""
+    turns = rotations((0, 0, 0), (1.5, 0, 0), (0, -2.0, 0), (0, 0, 2.5), (-0.8, 1.1, -1.4))
+    frame = blobs(CAMERA, (64, 128), POINTS)
+    found = sway_frames(np.stack([frame] * len(turns)), CAMERA, turns).astype(int)
+    for shown, turn in zip(found, turns, strict=True):
+        expected = blobs(CAMERA, (64, 128), [turn.T @ point for point in POINTS]).astype(int)
+        inner = np.s_[6:-6, 6:-6]
+        np.testing.assert_allclose(shown[inner], expected[inner], atol=8)
+    assert np.abs(found[1] - found[0]).max() > 50
+
+
+def test_a_camera_that_does_not_turn_changes_nothing():
+    still = rotations(*[(0, 0, 0)] * 4)
+    frames = np.random.default_rng(0).integers(0, 256, (4, 20, 30, 3), dtype=np.uint8)
+    np.testing.assert_array_equal(sway_frames(frames, CAMERA, still), frames)
+    flow = np.random.default_rng(1).normal(size=(3, 4, 6, 2)).astype(np.float32)
+    flow[0, 1, 2] = np.nan
+    np.testing.assert_allclose(sway_flow(flow, CAMERA, still), flow, atol=1e-6)
+    steps = np.random.default_rng(2).normal(0, 0.3, (3, 6))
+    np.testing.assert_allclose(sway_steps(steps, still), steps, atol=1e-12)
+
+
+def test_what_some_swaying_frame_does_not_see_repeats_the_edge_in_all_alike():
+    """The second frame lacks about 7 rows at its bottom and the third 13 columns at its left: none shows them."""
+    turns = rotations((0, 0, 0), (-4.0, 0, 0), (0, -5.0, 0))
+    frames = np.random.default_rng(0).integers(0, 256, (3, 48, 120, 1), dtype=np.uint8)
+    found = sway_frames(frames, CAMERA, turns)
+    rows = (found == found[:, -1:]).all((0, 2, 3))
+    columns = (found == found[:, :, :1]).all((0, 1, 3))
+    assert rows[-7:].all() and not rows[:-8].any()
+    assert columns[:13].all() and not columns[14:].any()
+    np.testing.assert_array_equal(found[0][4:-8, 14:-16], frames[0][4:-8, 14:-16])
+
+
+def test_swaying_steps_are_those_of_the_turned_poses():
+    rng = np.random.default_rng(3)
+    poses = geometry.accumulate(geometry.step_to_matrix(rng.normal(0, 0.4, (7, 6))))
+    turns = draw_sway(8, rng)
+    turned = poses.copy()
+    turned[:, :3, :3] = poses[:, :3, :3] @ turns
+    found = sway_steps(geometry.matrix_to_step(geometry.relative_steps(poses)), turns)
+    np.testing.assert_allclose(found, geometry.matrix_to_step(geometry.relative_steps(turned)), atol=1e-12)
+
+
+def test_a_turning_camera_gives_far_things_a_flow():
+    """The wall at infinity does not move for the camera that does not turn; for the other its flow is all rotation."""
+    turns = rotations((0, 0, 0), (0.5, 0, 0), (0.5, 1.0, -0.5))
+    found = sway_flow(np.zeros((2, 6, 16, 2), np.float32), CAMERA, turns)
+    fx, fy, cx, cy = (value / 8 for value in CAMERA)
+    v, u = np.mgrid[:6, :16].astype(float)
+    ray = np.stack([(u - cx) / fx, (v - cy) / fy, np.ones_like(u)], -1)
+    for step in (0, 1):
+        # R_{t+1}^T R_t takes directions from the one camera's axes to the next one's.
+        next_ray = ray @ (turns[step + 1].T @ turns[step]).T
+        place = next_ray[..., :2] / next_ray[..., 2:] * (fx, fy) + (cx, cy)
+        expected = place - np.stack([u, v], -1)
+        known = np.isfinite(found[step]).all(-1)
+        assert known.mean() > 0.6
+        np.testing.assert_allclose(found[step][known], expected[known], atol=1e-5)
+    assert np.isfinite(found[0]).all()  # frame 0 is not turned: it sees all of its map
+
+
+@pytest.mark.parametrize("seed", [3, 5])
+def test_swaying_flow_and_steps_fit_together_in_a_rendered_world(seed):
+    """What stands still obeys x^T [t] R x' = 0 with the flow and the step of the swaying camera, and not without."""
+    camera = (111.2, 111.2, 95.5, 18.5)
+    drive = synthetic.drive(seed, 7, height=48, width=192, camera=camera)
+    flow, steps = np.stack([drive.flow(index) for index in range(6)]), drive.steps()
+    turns = draw_sway(7, np.random.default_rng(seed))
+
+    def residual(flow, steps):
+        fx, fy, cx, cy = (value / 8 for value in camera)
+        v, u = np.mgrid[: flow.shape[1], : flow.shape[2]].astype(float)
+        here, there = (
+            np.stack([(column - cx) / fx, (row - cy) / fy, np.ones_like(column)], -1)
+            for column, row in ((u + 0 * flow[..., 0], v + 0 * flow[..., 0]), (u + flow[..., 0], v + flow[..., 1]))
+        )
+        essential = geometry.hat(steps[:, :3]) @ geometry.exp_so3(steps[:, 3:])
+        return np.nanmedian(abs(np.einsum("thwi,tij,thwj->thw", here, essential, there)), axis=(1, 2)).mean()
+
+    swaying = sway_flow(flow, camera, turns)
+    right = residual(swaying, sway_steps(steps, turns))
+    assert right < residual(swaying, steps) / 5
+    assert right < 1e-3 * np.linalg.norm(steps[:, :3], axis=1).mean()
+
+
+def test_sway_is_small_of_every_axis_and_never_the_same():
+    rng = np.random.default_rng(0)
+    steps = np.stack([sway_steps(np.zeros((12, 6)), draw_sway(13, rng)) for _ in range(400)])
+    deviation_deg = np.rad2deg(steps[..., 3:].std((0, 1)))
+    np.testing.assert_allclose(deviation_deg, [0.27, 0.33, 0.31], atol=0.06)
+    assert np.abs(steps[..., :3]).max() < 1e-12
+    attitude_deg = np.rad2deg(geometry.log_so3(np.stack([draw_sway(13, rng) for _ in range(400)])))
+    assert attitude_deg.std((0, 1)) == pytest.approx([0.63, 1.1, 0.45], abs=0.2) and np.abs(attitude_deg).max() < 8

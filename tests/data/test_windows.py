@@ -416,3 +416,27 @@ def test_mirrored_windows_have_mirrored_flow_and_narrow_ones_keep_it(toy):
     batch = taken(windows.training_batches([sequence], config, seed=0), 1)[0]
     for row, frames in enumerate(numbers(batch)):
         np.testing.assert_array_equal(batch["flow"][row], augment.mirror_flow(flow[frames[:-1]], camera))
+
+
+def test_swaying_windows_have_swaying_frames_labels_and_flow(toy):
+    camera = (9.0, 9.0, 7.5, 3.5)
+    pixels = np.random.default_rng(0).integers(0, 256, (40, 8, 16, 1), dtype=np.uint8)
+    flow = np.random.default_rng(1).normal(size=(40, 1, 2, 2)).astype(np.float32)
+    sequence = dataclasses.replace(toy(40), read=lambda i: pixels[i], flow=lambda i: flow[i], camera=camera)
+    config = config_of(image=dataclasses.replace(IMAGE, camera=camera), batch_size=20, window=4, sway=0.5)
+    config = dataclasses.replace(config, model=ModelConfig(flow_weight=1.0))
+    # Without sway the same windows come in the same order.
+    still = dataclasses.replace(config, data=dataclasses.replace(config.data, sway=0.0))
+    batch, plain = (taken(windows.training_batches([sequence], c, seed=0), 1)[0] for c in (config, still))
+    swayed = [(a != b).any() for a, b in zip(batch["images"], plain["images"], strict=True)]
+    assert 4 <= sum(swayed) <= 16
+    for row, changed in enumerate(swayed):
+        assert (batch["steps"][row] != plain["steps"][row]).all() == changed
+        # Translation is turned with the camera: its length stays.
+        length, before = (np.linalg.norm(b["steps"][row, :, :3], axis=1) for b in (batch, plain))
+        np.testing.assert_allclose(length, before, rtol=1e-5)
+        if not changed:
+            np.testing.assert_array_equal(batch["flow"][row], plain["flow"][row])
+    # Without intrinsics nobody can say what a turned camera sees.
+    unknown = taken(windows.training_batches([dataclasses.replace(sequence, camera=None)], config, seed=0), 1)[0]
+    np.testing.assert_array_equal(unknown["steps"], plain["steps"])
