@@ -60,7 +60,7 @@ def plot_paths(
         axes.plot(across, ahead, color=colour, linestyle=stroke, linewidth=1.6, label=name, zorder=3)
     _mark_start(axes, *(values[0] for values in _from_above(into_first @ first)))
     _finish_map(axes, title)
-    axes.legend(loc="best", fontsize=9, framealpha=0.9)
+    _legend_below(figure, axes)
     save(figure, path)
 
 
@@ -97,7 +97,7 @@ def plot_trajectory(trajectory: "Trajectory", path: str | os.PathLike[str]) -> N
     _limit(axes, np.stack([across, ahead], axis=1), np.stack([across, ahead], axis=1)[shown], reach)
     length_m = np.linalg.norm(np.diff(poses[:, :3, 3], axis=0), axis=1).sum()
     _finish_map(axes, f"Predicted path from above, {len(poses)} frames, {length_m:.1f} m (no alignment)")
-    axes.legend(loc="best", fontsize=9, framealpha=0.9)
+    _legend_below(figure, axes)
     save(figure, path)
 
 
@@ -232,6 +232,11 @@ def _mark_start(axes: Any, across: float, ahead: float) -> None:
         [across], [ahead], linestyle="", marker="o", markersize=9, markerfacecolor="white", markeredgecolor="black",
         markeredgewidth=1.8, label="start", zorder=5,
     )  # fmt: skip
+
+
+def _legend_below(figure: Any, axes: Any) -> None:
+    """Say below the map what is what: a path may end anywhere on it."""
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside lower center", fontsize=9)
 
 
 def _finish_map(axes: Any, title: str) -> None:

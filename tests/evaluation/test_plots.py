@@ -117,7 +117,7 @@ def test_paths_are_seen_from_the_first_camera(tmp_path, monkeypatch):
         np.testing.assert_allclose(line.get_xdata(), 0, atol=1e-12)
         np.testing.assert_allclose(line.get_ydata(), np.arange(10), atol=1e-12)
     assert axes.get_title() == "T" and axes.get_aspect() == 1
-    assert [text.get_text() for text in axes.get_legend().get_texts()] == ["ground truth", "same", "start"]
+    assert [text.get_text() for text in figures[0].legends[0].get_texts()] == ["ground truth", "same", "start"]
 
 
 @pytest.mark.parametrize("steps", [300])
