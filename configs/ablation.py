@@ -17,6 +17,6 @@ config = dataclasses.replace(
     # The same view, at two thirds of its pixels in each direction.
     image=dataclasses.replace(shipped.image, height=32, width=128, camera=(74.133, 74.133, 63.5, 12.167)),
     model=dataclasses.replace(shipped.model, width=0.125, lstm_hidden=64),
-    data=dataclasses.replace(shipped.data, worlds=240, world_frames=60, validation_worlds=24),
+    data=dataclasses.replace(shipped.data, worlds=240, world_frames=60, validation_worlds=24, sway=0.0),
     training=dataclasses.replace(shipped.training, epochs=4, steps_per_epoch=300),
 )
