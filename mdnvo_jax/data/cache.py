@@ -23,7 +23,7 @@ from mdnvo_jax.config import ImageConfig
 from mdnvo_jax.data import images
 from mdnvo_jax.data.sequence import Sequence
 from mdnvo_jax.errors import InputError
-from mdnvo_jax.files import whole_file, write_text
+from mdnvo_jax.files import remove_remnants, whole_file, write_text
 
 # Of the free disk, what is left alone: other programs need some, and so does the file system.
 _SPARE_BYTES = 200_000_000
@@ -200,8 +200,8 @@ def _write(
     path = directory / f"{_file_name(sequence.name)}.json"
     # A description of older frames must not stand beside the new ones.
     path.unlink(missing_ok=True)
-    for remnant in directory.glob(f".{path.stem}-*.npy"):
-        remnant.unlink()  # of a run that was killed
+    for suffix in (".npy", ".flow.npy"):
+        remove_remnants(path.with_suffix(suffix))
     shape = (sequence.count, image_config.height, image_config.width, image_config.channels)
     first = sequence.read(0)
     with whole_file(path.with_suffix(".npy")) as temporary:

@@ -94,13 +94,28 @@ def test_an_interrupted_sequence_is_absent_and_done_again(sequences, image, tmp_
     assert sorted(path.name for path in tmp_path.iterdir() if path.name != "kitti") == ["00.json", "00.npy"]
     with pytest.raises(InputError, match=r"has no finished sequence 07: found 00"):
         cache.read_cache(tmp_path, image, ["00", "07"])
-    # A process that was killed outright leaves its temporary file, or an array without a description.
-    (tmp_path / ".07-abc.npy").write_bytes(b"half")
+    # A process that was killed outright leaves its temporary files, or an array without a description.
+    (tmp_path / ".07-abcdefgh.npy").write_bytes(b"half")
+    (tmp_path / ".07.flow-abcdefgh.npy").write_bytes(b"half")
     (tmp_path / "07.npy").write_bytes(b"half")
     assert [s.name for s in cache.read_cache(tmp_path, image)] == ["00"]
     cache.prepare_cache(sequences, image, tmp_path)
     assert not list(tmp_path.glob(".*"))
     assert [s.name for s in cache.read_cache(tmp_path, image, ["07", "00"])] == ["07", "00"]
+
+
+def test_two_that_write_the_same_sequence_leave_each_other_alone(sequences, image, tmp_path):
+    """The second begins and ends while the first has its temporary file open, and lets it be."""
+
+    def meanwhile(name, done, count):
+        if done == 3:
+            assert list(tmp_path.glob(".07-*.npy"))
+            cache.prepare_cache(sequences[1:], image, tmp_path)
+
+    cache.prepare_cache(sequences[1:], image, tmp_path, meanwhile)
+    assert sorted(path.name for path in tmp_path.glob("*07*")) == ["07.json", "07.npy"]
+    expected = images.prepare(sequences[1].read(5), sequences[1].camera, image)
+    np.testing.assert_array_equal(cache.read_cache(tmp_path, image)[0].read(5), expected)
 
 
 def test_a_changed_source_is_prepared_again(kitti_root, sequences, image, tmp_path):
