@@ -1,5 +1,7 @@
 """Augmentation of windows: what is seen changes, and the labels change exactly with it."""
 
+import dataclasses
+import functools
 import math
 import statistics
 
@@ -8,7 +10,8 @@ import numpy as np
 
 from mdnvo_jax import geometry
 from mdnvo_jax.data import images
-from mdnvo_jax.data.sequence import Camera
+from mdnvo_jax.data.sequence import Camera, Sequence
+from mdnvo_jax.errors import InputError
 from mdnvo_jax.model.conv import FLOW_STRIDE
 
 # What one draw of strength 1 does, as standard deviations: natural logarithms of gain and gamma of the window, of the
@@ -79,12 +82,16 @@ def narrow(frames: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return _window_on(frames, round(top * height), round(bottom * height), round(left * width), round(right * width))
 
 
-def draw_sway(count: int, rng: np.random.Generator) -> np.ndarray:
-    """Return rotations `[count, 3, 3]` of a camera against its mount, one for each frame of a window, a few degrees."""
+def draw_sway(count: int, rng: np.random.Generator, *, turning: bool = True) -> np.ndarray:
+    """Return rotations `[count, 3, 3]` of a camera against its mount, one a frame, a few degrees.
+
+    `turning` adds a yaw that grows with every frame, for windows; over a whole drive it would look aside.
+    """
     frame = np.arange(count) - (count - 1) / 2
     frequency, phase = rng.uniform(0, 0.5, (2, _SWAY_SINES, 3)) * np.array([1, 4 * np.pi])[:, None, None]
     swing = np.sqrt(2 / _SWAY_SINES) * np.sin(2 * np.pi * frequency * frame[:, None, None] + phase).sum(1)
     offset, rate, strength = rng.standard_normal((3, 3)) * (_SWAY_OFFSET_DEG, _SWAY_RATE_DEG, _SWAY_SWING_DEG)
+    rate = rate if turning else np.zeros(3)
     return geometry.exp_so3(np.deg2rad(offset + rate * frame[:, None] + strength * swing))
 
 
@@ -100,25 +107,9 @@ def sway_frames(frames: np.ndarray, camera: Camera, rotations: np.ndarray) -> np
       camera: fx, fy, cx, cy of the frames.
       rotations: attitude of the turned camera in the axes of the other, `[T+1, 3, 3]`.
     """
-    height, width = frames.shape[1:3]
     maps = _homographies(camera, rotations)
-    v, u = np.mgrid[:height, :width].astype(float)
-    edge = (u == 0) | (u == width - 1) | (v == 0) | (v == height - 1)
-    seen = _through(maps[:, None], np.stack([u[edge], v[edge]], -1))
-    over = (-seen[..., 1], seen[..., 1] - (height - 1), -seen[..., 0], seen[..., 0] - (width - 1))
-    sides = (v[edge] == 0, v[edge] == height - 1, u[edge] == 0, u[edge] == width - 1)
-    missing = [max(0, math.ceil(excess[:, side].max())) for excess, side in zip(over, sides, strict=True)]
-    turned = [
-        cv2.warpPerspective(
-            frame,
-            homography,
-            (width, height),
-            flags=cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP,
-            borderMode=cv2.BORDER_REPLICATE,
-        ).reshape(frame.shape)
-        for frame, homography in zip(frames, maps, strict=True)
-    ]
-    return _window_on(np.stack(turned), *missing)
+    turned = np.stack([_turned(frame, homography) for frame, homography in zip(frames, maps, strict=True)])
+    return _window_on(turned, *_unseen(frames.shape[1:3], maps))
 
 
 def sway_flow(flow: np.ndarray, camera: Camera, rotations: np.ndarray) -> np.ndarray:
@@ -156,6 +147,30 @@ def sway_steps(steps: np.ndarray, rotations: np.ndarray) -> np.ndarray:
     return geometry.matrix_to_step(geometry.compose(moved, turns[1:]))
 
 
+def sway_sequence(sequence: Sequence, seed: int) -> Sequence:
+    """Return `sequence` as a camera films it that sways on its mount as `seed` says: poses follow, flow is not known.
+
+    Raises:
+      InputError: the sequence has no camera.
+    """
+    camera = sequence.camera
+    if camera is None:
+        raise InputError(f"sequence {sequence.name} has no intrinsics: what a swaying camera sees is not known")
+    rotations = draw_sway(sequence.count, np.random.default_rng(seed), turning=False)
+    maps = _homographies(camera, rotations)
+    unseen = functools.cache(lambda size: _unseen(size, maps))
+    poses = None
+    if sequence.poses is not None:
+        poses = sequence.poses.copy()
+        poses[:, :3, :3] = poses[:, :3, :3] @ rotations
+
+    def read(index: int) -> np.ndarray:
+        frame = sequence.read(index)
+        return _window_on(_turned(frame, maps[index]), *unseen(frame.shape[:2]))
+
+    return dataclasses.replace(sequence, read=read, poses=poses, flow=None)
+
+
 def photometric(frames: np.ndarray, strength: float, rng: np.random.Generator) -> np.ndarray:
     """Return a window of frames, uint8 `[T+1, H, W, C]`, as another camera in another light might have taken it.
 
@@ -189,6 +204,30 @@ def _window_on(frames: np.ndarray, top: int, bottom: int, left: int, right: int)
     rows = np.clip(np.arange(height), top, height - bottom - 1)
     columns = np.clip(np.arange(width), left, width - right - 1)
     return frames[..., rows, :, :][..., columns, :]
+
+
+def _turned(frame: np.ndarray, homography: np.ndarray) -> np.ndarray:
+    """Return a frame `[H, W, C]` whose pixel x shows what pixel `homography x` did; the edge is repeated."""
+    flags = cv2.INTER_CUBIC | cv2.WARP_INVERSE_MAP
+    size = frame.shape[1], frame.shape[0]
+    return cv2.warpPerspective(frame, homography, size, flags=flags, borderMode=cv2.BORDER_REPLICATE).reshape(
+        frame.shape
+    )
+
+
+def _unseen(size: tuple[int, int], maps: np.ndarray) -> tuple[int, int, int, int]:
+    """Return the rows and columns (top, bottom, left, right) that some frame of `size` lacks when `maps` turn it."""
+    height, width = size
+    v, u = np.mgrid[:height, :width].astype(float)
+    edge = (u == 0) | (u == width - 1) | (v == 0) | (v == height - 1)
+    u, v = u[edge], v[edge]
+    column, row = np.moveaxis(_through(maps[:, None], np.stack([u, v], -1)), -1, 0)
+    return (
+        max(0, math.ceil(-row[:, v == 0].min())),
+        max(0, math.ceil(row[:, v == height - 1].max() - (height - 1))),
+        max(0, math.ceil(-column[:, u == 0].min())),
+        max(0, math.ceil(column[:, u == width - 1].max() - (width - 1))),
+    )
 
 
 def _homographies(camera: Camera, rotations: np.ndarray) -> np.ndarray:

@@ -51,6 +51,7 @@ def parser() -> Parser:
     height_help = "of its camera above the road, synthetic: of all worlds' cameras [that of the training]"
     add("--camera-height", type=float, metavar="METRES", help=height_help)
     add("--other-lenses", action="store_true", help="synthetic: a focal length and principal point of its own a world")
+    add("--sway", action="store_true", help="turn each frame by some tenths of a degree, as a camera on a bad mount")
     add("--mode", choices=("offline", "streaming"), default="offline", help="streaming: past alone [%(default)s]")
     add("--estimate", choices=("mean", "strongest"), default="mean", help="what a mixture is reported by [%(default)s]")
     add("--scale-sigma", type=float, metavar="SHARE", help="1-sigma error of each path's scale [fitted, or 0]")

@@ -48,6 +48,7 @@ def from_options(options: argparse.Namespace) -> Report:
       InputError: an option, the checkpoint or the data is unusable.
     """
     from mdnvo_jax import predictor
+    from mdnvo_jax.data import augment
 
     if options.block < 1:
         raise InputError(f"--block is {options.block}: expected 1 frame or more")
@@ -57,7 +58,9 @@ def from_options(options: argparse.Namespace) -> Report:
         options.checkpoint, recalibrated=not options.no_recalibration, camera_height_m=options.camera_height
     )
     predicted = []
-    for sequence in sequences(options, model.config):
+    for number, sequence in enumerate(sequences(options, model.config)):
+        if options.sway:
+            sequence = augment.sway_sequence(sequence, number)
         if sequence.poses is None or sequence.count < 2:
             raise InputError(f"sequence {sequence.name} has no poses of two frames: there is nothing to judge against")
         bar = functools.partial(track, name=sequence.name)
@@ -68,6 +71,8 @@ def from_options(options: argparse.Namespace) -> Report:
     labels = model.model.labels
     step = MeanStep(np.asarray(labels.mean, float), np.asarray(labels.std, float), "mean step of the training split")
     how = f"{options.mode}, {options.estimate}{'' if model.sigma_scale is None else ', sigma recalibrated'}"
+    if options.sway:
+        how += ", swaying camera"
     if scale_sigma := predicted[0].trajectory.scale_sigma:
         how += f", scale known to {100 * scale_sigma:.1f} %"
     return evaluate(f"model ({how})", predicted, step, block=options.block)

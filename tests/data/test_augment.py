@@ -1,3 +1,5 @@
+import dataclasses
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,8 +15,10 @@ from mdnvo_jax.data.augment import (
     photometric,
     sway_flow,
     sway_frames,
+    sway_sequence,
     sway_steps,
 )
+from mdnvo_jax.errors import InputError
 
 
 def blobs(camera, size, points):
@@ -269,3 +273,20 @@ def test_sway_is_small_of_every_axis_and_never_the_same():
     assert np.abs(steps[..., :3]).max() < 1e-12
     attitude_deg = np.rad2deg(geometry.log_so3(np.stack([draw_sway(13, rng) for _ in range(400)])))
     assert attitude_deg.std((0, 1)) == pytest.approx([0.63, 1.1, 0.45], abs=0.2) and np.abs(attitude_deg).max() < 8
+
+
+def test_a_swaying_drive_has_its_frames_and_poses_turned_alike():
+    camera = (40.0, 40.0, 31.5, 11.5)
+    drive = synthetic.drive(4, 8, height=24, width=64, camera=camera)
+    swaying = sway_sequence(drive, 9)
+    turns = np.linalg.inv(drive.poses[:, :3, :3]) @ swaying.poses[:, :3, :3]
+    np.testing.assert_allclose(swaying.steps(), sway_steps(drive.steps(), turns), atol=1e-9)
+    expected = sway_frames(np.stack([drive.read(index) for index in range(8)]), camera, turns)
+    # In any order, as often as one likes.
+    for index in (5, 0, 7, 5):
+        np.testing.assert_array_equal(swaying.read(index), expected[index])
+    assert swaying.flow is None
+    attitude_deg = np.rad2deg(geometry.log_so3(turns))
+    assert 0.02 < np.diff(attitude_deg, axis=0).std() < 2 and np.abs(attitude_deg).max() < 5
+    with pytest.raises(InputError, match="no intrinsics"):
+        sway_sequence(dataclasses.replace(drive, camera=None), 9)
