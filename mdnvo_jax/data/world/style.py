@@ -104,10 +104,17 @@ def draw_style(seed: int) -> Style:
     cruise = 0.0 if rng.random() < 0.04 else 1 + 29 * rng.random() ** 0.7
     # Slow worlds are towns, fast ones open roads, with a wide overlap.
     town = float(np.clip((19 - cruise) / 10 + rng.normal(0, 0.35), 0, 1))
+    # But for half of those that wind: ramps and narrow bends in the open. Else a network would learn that who turns on a
+    # smooth road in the open is slow.
+    turns = stream(seed, "winding")
+    winding = bool(3 < cruise < 15 and turns.random() < 0.5)
+    in_the_open = winding and bool(turns.random() < 0.5)
+    town = 0.15 * turns.random() if in_the_open else town
+    ramp = in_the_open and bool(turns.random() < 0.6)
     motorway = bool(cruise > 19 and rng.random() < 0.6)
     lanes = int(rng.integers(2, 4)) if motorway else int(1 + (rng.random() < 0.12))
-    lane = rng.uniform(3.3, 3.8) if motorway else rng.uniform(2.6, 3.6)
-    shoulder = rng.uniform(0.8, 2.5) if motorway else rng.uniform(0.1, 0.6) + town * rng.choice([0.0, 2.0])
+    lane = rng.uniform(3.3, 3.8) if motorway or ramp else rng.uniform(2.6, 3.6)
+    shoulder = rng.uniform(0.8, 2.5) if motorway or ramp else rng.uniform(0.1, 0.6) + town * rng.choice([0.0, 2.0])
     wooded = rng.random()
     weather = stream(seed, "weather")
     night, rainy = weather.random() < 0.12, weather.random() < 0.14
@@ -130,8 +137,8 @@ def draw_style(seed: int) -> Style:
         stops=0.15 * town * rng.random(),
         slows=0.8 * (1 - motorway) * rng.random(),
         bends=rng.random(),
-        winding=bool(3 < cruise < 15 and stream(seed, "winding").random() < 0.5),
-        side_roads=0.6 * town + 0.1 * (not motorway),
+        winding=winding,
+        side_roads=0.6 * town + 0.1 * (not (motorway or ramp)),
         steepness=abs(rng.normal(0, 0.03)) if town > 0.5 else abs(rng.normal(0, 0.045)),
         side=1 if rng.random() < 0.75 else -1,
         lane_m=lane,
@@ -145,7 +152,7 @@ def draw_style(seed: int) -> Style:
         parked=town * rng.uniform(0, 0.8),
         poles=rng.uniform(0.1, 1.0),
         traffic=rng.uniform(0, 0.7) if motorway else rng.uniform(0, 0.4),
-        rails=bool(motorway and rng.random() < 0.7) or bool(town < 0.3 and rng.random() < 0.2),
+        rails=bool((motorway or ramp) and rng.random() < 0.7) or bool(town < 0.3 and rng.random() < 0.2),
         overpasses=0.35 if motorway else 0.05,
         colours=_colours(rng, overcast)[[1 if gravel else 0, 1, 2, 3, 4, 5, 6]],
         sun=sun,
@@ -153,10 +160,10 @@ def draw_style(seed: int) -> Style:
         sky_strength=daylight * (0.9 if night else sky_strength),
         clouds=rng.uniform(0.6, 1.0) if overcast else rng.uniform(0, 0.6),
         haze_m=float(haze * (1 - 0.7 * amount * rainy)),
-        centre_line=marked * (2 if motorway else int(rng.choice(3, p=[0.25, 0.55, 0.2]))),
+        centre_line=marked * (2 if motorway or ramp else int(rng.choice(3, p=[0.25, 0.55, 0.2]))),
         lane_period_m=rng.choice([6.0, 9.0, 12.0, 18.0]),
         lane_duty=rng.uniform(0.3, 0.5),
-        edge_line=bool(motorway or rng.random() < 0.5 * (1.2 - town)) and marked,
+        edge_line=bool(motorway or ramp or rng.random() < 0.5 * (1.2 - town)) and marked,
         paint=rng.uniform(0.4, 0.8),
         wear=rng.uniform(0.1, 0.9),
         roughness=rng.uniform(0.12, 0.45) + 0.25 * gravel,
