@@ -16,7 +16,7 @@ class Style(NamedTuple):
       acceleration_mps2: of speeding up and braking.
       stops, slows: chances that a place on the road makes the car stop, or slow down.
       bends: strength of ordinary bends, as a share of what the speed allows.
-      winding: whether corner follows corner, as sharp as the car can take them: turns at junctions, narrow streets.
+      winding: whether corner follows corner, as sharp as the car can take them: junctions, narrow streets, ramps.
       side_roads: chance of a side road every 90 m.
       steepness: largest slope of the ground, m/m.
       side: 1 for traffic on the right, -1 on the left.
@@ -104,8 +104,8 @@ def draw_style(seed: int) -> Style:
     cruise = 0.0 if rng.random() < 0.04 else 1 + 29 * rng.random() ** 0.7
     # Slow worlds are towns, fast ones open roads, with a wide overlap.
     town = float(np.clip((19 - cruise) / 10 + rng.normal(0, 0.35), 0, 1))
-    # But for half of those that wind: ramps and narrow bends in the open. Else a network would learn that who turns on a
-    # smooth road in the open is slow.
+    # But for half of those that wind: ramps and narrow bends in the open. Else a network would learn that who turns
+    # sharply is in a town, and that in the open the road is straight.
     turns = stream(seed, "winding")
     winding = bool(3 < cruise < 15 and turns.random() < 0.5)
     in_the_open = winding and bool(turns.random() < 0.5)
