@@ -6,12 +6,13 @@
 
 Frames of any camera with known intrinsics are brought to one virtual camera: 82 degrees across, as KITTI's, without the
 upper third of the sky. What each choice is worth at a small budget is in BENCHMARKS.md (`bin/ablate` on
-`configs/ablation.py`). The weights that ship had two sittings: this file, 24 epochs from scratch, on worlds whose
-winding roads were driven slowly; then, on the worlds as they are now and from the first sitting's weights, which
-`bin/ship_weights` had put into a copy of the repository,
+`configs/ablation.py`). The weights that ship had three sittings, each from the one before, which `bin/ship_weights` had
+put into a copy of the repository: this file from scratch on 2,000 worlds, and twice
 
-    python -m mdnvo_jax.train configs/pretrained.py --workdir runs/second --data.cache CACHE \\
-        --training.initial_weights shipped --training.learning_rate 5e-4 --training.epochs 20
+    python -m mdnvo_jax.train configs/pretrained.py --workdir runs/next --data.cache CACHE \\
+        --training.initial_weights shipped --training.learning_rate 5e-4 --training.epochs 22
+
+on worlds whose roads wound ever more like real ones. BENCHMARKS.md says which were which.
 """
 
 from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig, TrainingConfig
