@@ -12,6 +12,7 @@ checkpoints may use.
 import io
 import math
 import pickletools
+import warnings
 import zipfile
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -77,7 +78,10 @@ def open_tensors(path: str | Path) -> TensorFile:
     except OSError as error:
         raise InputError(f"cannot read {path} ({error.strerror}): expected a checkpoint file of PyTorch") from error
     try:
-        content, storages = (_from_archive if data.startswith(b"PK") else _from_stream)(data)
+        with warnings.catch_warnings():
+            # Damaged text may hold escapes that Python warns of, at another place than the file.
+            warnings.simplefilter("ignore", DeprecationWarning)
+            content, storages = (_from_archive if data.startswith(b"PK") else _from_stream)(data)
     except _MALFORMED as error:
         reason = str(error) if isinstance(error, _RefusedError) else f"damaged, {type(error).__name__}"
         raise InputError(

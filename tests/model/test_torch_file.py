@@ -276,6 +276,13 @@ def test_any_damage_is_an_input_error_or_does_not_matter(golden_bytes, tmp_path_
         pass
 
 
+def test_an_escape_in_damaged_text_is_damage_and_no_warning(golden_bytes, tmp_path):
+    damaged = bytearray(golden_bytes["program"])
+    damaged[damaged.index(b"ccollections") + 1] = ord("\\")  # a global's name "\\ollections"
+    with pytest.raises(InputError, match="not readable"):
+        open_tensors(archive_file(tmp_path / "x.pth", bytes(damaged)))
+
+
 @pytest.fixture(scope="module")
 def golden_bytes():
     folder = Path(__file__).resolve().parents[1] / "golden"
