@@ -11,6 +11,7 @@ import numpy as np
 from mdnvo_jax import geometry
 from mdnvo_jax.data import images
 from mdnvo_jax.data.sequence import Camera, Sequence
+from mdnvo_jax.data.world.motion import swing
 from mdnvo_jax.errors import InputError
 from mdnvo_jax.model.conv import FLOW_STRIDE
 
@@ -88,11 +89,11 @@ def draw_sway(count: int, rng: np.random.Generator, *, turning: bool = True) -> 
     `turning` adds a yaw that grows with every frame, for windows; over a whole drive it would look aside.
     """
     frame = np.arange(count) - (count - 1) / 2
-    frequency, phase = rng.uniform(0, 0.5, (2, _SWAY_SINES, 3)) * np.array([1, 4 * np.pi])[:, None, None]
-    swing = np.sqrt(2 / _SWAY_SINES) * np.sin(2 * np.pi * frequency * frame[:, None, None] + phase).sum(1)
+    frequency, phase = rng.uniform(0, 0.5, (_SWAY_SINES, 3)), rng.uniform(0, 2 * np.pi, (_SWAY_SINES, 3))
+    swinging = swing(frequency, phase, frame[:, None, None])
     offset, rate, strength = rng.standard_normal((3, 3)) * (_SWAY_OFFSET_DEG, _SWAY_RATE_DEG, _SWAY_SWING_DEG)
     rate = rate if turning else np.zeros(3)
-    return geometry.exp_so3(np.deg2rad(offset + rate * frame[:, None] + strength * swing))
+    return geometry.exp_so3(np.deg2rad(offset + rate * frame[:, None] + strength * swinging))
 
 
 def sway_frames(frames: np.ndarray, camera: Camera, rotations: np.ndarray) -> np.ndarray:

@@ -157,7 +157,12 @@ def _bumps(style: Style, s: np.ndarray, speed: np.ndarray) -> tuple[np.ndarray, 
     return np.deg2rad(1.0) * ring, -0.03 * ring
 
 
+def swing(frequency: np.ndarray, phase: np.ndarray, time: np.ndarray) -> np.ndarray:
+    """Return a swinging of unit variance at `time`: a sine for each row of `frequency`, added up over axis 1."""
+    return np.sqrt(2 / len(frequency)) * np.sin(2 * np.pi * frequency * time + phase).sum(1)
+
+
 def _sway(rng: np.random.Generator, time: np.ndarray, band_hz: tuple[float, float]) -> np.ndarray:
     """Return a swaying of unit variance within a band of frequencies, at `time`."""
     frequency, phase = rng.uniform(*band_hz, _SINES), rng.uniform(0, 2 * np.pi, _SINES)
-    return np.sqrt(2 / _SINES) * np.sin(2 * np.pi * frequency * time[:, None] + phase).sum(1)
+    return swing(frequency, phase, time[:, None])

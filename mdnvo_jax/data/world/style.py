@@ -112,9 +112,10 @@ def draw_style(seed: int) -> Style:
     town = 0.15 * turns.random() if in_the_open else town
     ramp = in_the_open and bool(turns.random() < 0.6)
     motorway = bool(cruise > 19 and rng.random() < 0.6)
+    as_motorway = motorway or ramp
     lanes = int(rng.integers(2, 4)) if motorway else int(1 + (rng.random() < 0.12))
-    lane = rng.uniform(3.3, 3.8) if motorway or ramp else rng.uniform(2.6, 3.6)
-    shoulder = rng.uniform(0.8, 2.5) if motorway or ramp else rng.uniform(0.1, 0.6) + town * rng.choice([0.0, 2.0])
+    lane = rng.uniform(3.3, 3.8) if as_motorway else rng.uniform(2.6, 3.6)
+    shoulder = rng.uniform(0.8, 2.5) if as_motorway else rng.uniform(0.1, 0.6) + town * rng.choice([0.0, 2.0])
     wooded = rng.random()
     weather = stream(seed, "weather")
     night, rainy = weather.random() < 0.12, weather.random() < 0.14
@@ -138,7 +139,7 @@ def draw_style(seed: int) -> Style:
         slows=0.8 * (1 - motorway) * rng.random(),
         bends=rng.random(),
         winding=winding,
-        side_roads=0.6 * town + 0.1 * (not (motorway or ramp)),
+        side_roads=0.6 * town + 0.1 * (not as_motorway),
         steepness=abs(rng.normal(0, 0.03)) if town > 0.5 else abs(rng.normal(0, 0.045)),
         side=1 if rng.random() < 0.75 else -1,
         lane_m=lane,
@@ -152,7 +153,7 @@ def draw_style(seed: int) -> Style:
         parked=town * rng.uniform(0, 0.8),
         poles=rng.uniform(0.1, 1.0),
         traffic=rng.uniform(0, 0.7) if motorway else rng.uniform(0, 0.4),
-        rails=bool((motorway or ramp) and rng.random() < 0.7) or bool(town < 0.3 and rng.random() < 0.2),
+        rails=bool(as_motorway and rng.random() < 0.7) or bool(town < 0.3 and rng.random() < 0.2),
         overpasses=0.35 if motorway else 0.05,
         colours=_colours(rng, overcast)[[1 if gravel else 0, 1, 2, 3, 4, 5, 6]],
         sun=sun,
@@ -160,10 +161,10 @@ def draw_style(seed: int) -> Style:
         sky_strength=daylight * (0.9 if night else sky_strength),
         clouds=rng.uniform(0.6, 1.0) if overcast else rng.uniform(0, 0.6),
         haze_m=float(haze * (1 - 0.7 * amount * rainy)),
-        centre_line=marked * (2 if motorway or ramp else int(rng.choice(3, p=[0.25, 0.55, 0.2]))),
+        centre_line=marked * (2 if as_motorway else int(rng.choice(3, p=[0.25, 0.55, 0.2]))),
         lane_period_m=rng.choice([6.0, 9.0, 12.0, 18.0]),
         lane_duty=rng.uniform(0.3, 0.5),
-        edge_line=bool(motorway or ramp or rng.random() < 0.5 * (1.2 - town)) and marked,
+        edge_line=bool(as_motorway or rng.random() < 0.5 * (1.2 - town)) and marked,
         paint=rng.uniform(0.4, 0.8),
         wear=rng.uniform(0.1, 0.9),
         roughness=rng.uniform(0.12, 0.45) + 0.25 * gravel,
