@@ -117,7 +117,7 @@ class DataConfig:
     # Chance that a window is shown as a camera with a narrower view would have it, the edge repeated outwards, as
     # bringing such a camera's frames to the virtual camera does.
     narrow: float = 0.0
-    # Chance that the camera of a window sways on its mount: each frame is turned by a small rotation of its own, and
+    # Chance that the camera of a window sways on its mount and pans: each frame is turned by a rotation of its own, and
     # the labels with it. Needs the camera's intrinsics.
     sway: float = 0.0
     # Median time between two frames of the training sequences; 0: training takes it from them. Prediction says where

@@ -29,9 +29,10 @@ _NOISE = 4.0
 _NARROW = (0.3, 0.12, 0.25, 0.25)
 # Attitude of a swaying camera about x, y and z (pitch, yaw, roll), as standard deviations: what stays the same over a
 # window, what grows with every frame, and the strength of what swings, each in degrees. The swing is of the size of the
-# rendered cars' own and of any frequency up to half the frame rate: no spring's alone.
+# rendered cars' own and of any frequency up to half the frame rate: no spring's alone. The growth is as fast as cars
+# turn in corners, at any speed: else a network learns that who turns drives slowly, and reads his speed so.
 _SWAY_OFFSET_DEG = (0.6, 0.6, 0.4)
-_SWAY_RATE_DEG = (0.0, 0.25, 0.0)
+_SWAY_RATE_DEG = (0.0, 0.8, 0.0)
 _SWAY_SWING_DEG = (0.2, 0.15, 0.2)
 _SWAY_SINES = 5
 # Rows and columns by which the noise of one frame may be moved against that of another.
@@ -83,17 +84,28 @@ def narrow(frames: np.ndarray, rng: np.random.Generator) -> np.ndarray:
     return _window_on(frames, round(top * height), round(bottom * height), round(left * width), round(right * width))
 
 
-def draw_sway(count: int, rng: np.random.Generator, *, turning: bool = True) -> np.ndarray:
-    """Return rotations `[count, 3, 3]` of a camera against its mount, one a frame, a few degrees.
+def most_pan(camera: Camera, width: int) -> float:
+    """Return the angle, rad, by which a pan may move a frame `width` pixels wide: a quarter of it is lost then."""
+    return math.atan(width / 4 / camera[0])
 
-    `turning` adds a yaw that grows with every frame, for windows; over a whole drive it would look aside.
+
+def draw_sway(count: int, rng: np.random.Generator, *, most_pan_rad: float) -> np.ndarray:
+    """Return rotations `[count, 3, 3]` of a camera against its mount, one a frame: a few degrees, and a pan.
+
+    Args:
+      count: of the frames.
+      rng: decides.
+      most_pan_rad: how far the yaw that grows with every frame may have come at either end; see `most_pan`. 0 for
+        whole drives, over which the camera would look aside.
     """
     frame = np.arange(count) - (count - 1) / 2
     frequency, phase = rng.uniform(0, 0.5, (_SWAY_SINES, 3)), rng.uniform(0, 2 * np.pi, (_SWAY_SINES, 3))
     swinging = swing(frequency, phase, frame[:, None, None])
     offset, rate, strength = rng.standard_normal((3, 3)) * (_SWAY_OFFSET_DEG, _SWAY_RATE_DEG, _SWAY_SWING_DEG)
-    rate = rate if turning else np.zeros(3)
-    return geometry.exp_so3(np.deg2rad(offset + rate * frame[:, None] + strength * swinging))
+    pan = np.deg2rad(rate) * frame[:, None]
+    # The whole pan slows down where its ends would go too far.
+    pan *= min(1.0, most_pan_rad / max(np.abs(pan).max(), 1e-12))
+    return geometry.exp_so3(np.deg2rad(offset + strength * swinging) + pan)
 
 
 def sway_frames(frames: np.ndarray, camera: Camera, rotations: np.ndarray) -> np.ndarray:
@@ -157,7 +169,7 @@ def sway_sequence(sequence: Sequence, seed: int) -> Sequence:
     camera = sequence.camera
     if camera is None:
         raise InputError(f"sequence {sequence.name} has no intrinsics: what a swaying camera sees is not known")
-    rotations = draw_sway(sequence.count, np.random.default_rng(seed), turning=False)
+    rotations = draw_sway(sequence.count, np.random.default_rng(seed), most_pan_rad=0.0)
     maps = _homographies(camera, rotations)
     unseen = functools.cache(lambda size: _unseen(size, maps))
     poses = None

@@ -270,7 +270,8 @@ def _training_window(
             flow = np.stack([sequence.flow(int(index)) for index in indices[:-1]])
     camera = cameras[0]
     if camera is not None and data.sway > 0 and rng.random() < data.sway:
-        rotations = augment.draw_sway(steps + 1, rng)
+        most_pan = augment.most_pan(camera, frames[0].shape[1])
+        rotations = augment.draw_sway(steps + 1, rng, most_pan_rad=most_pan)
         frames = list(augment.sway_frames(np.stack(frames), camera, rotations))
         labels = augment.sway_steps(labels, rotations)
         flow = None if flow is None else augment.sway_flow(flow, camera, rotations)

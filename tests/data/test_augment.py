@@ -11,6 +11,7 @@ from mdnvo_jax.data.augment import (
     draw_sway,
     mirror_flow,
     mirror_frame,
+    most_pan,
     narrow,
     photometric,
     sway_flow,
@@ -216,7 +217,7 @@ def test_what_some_swaying_frame_does_not_see_repeats_the_edge_in_all_alike():
 def test_swaying_steps_are_those_of_the_turned_poses():
     rng = np.random.default_rng(3)
     poses = geometry.accumulate(geometry.step_to_matrix(rng.normal(0, 0.4, (7, 6))))
-    turns = draw_sway(8, rng)
+    turns = draw_sway(8, rng, most_pan_rad=0.2)
     turned = poses.copy()
     turned[:, :3, :3] = poses[:, :3, :3] @ turns
     found = sway_steps(geometry.matrix_to_step(geometry.relative_steps(poses)), turns)
@@ -247,7 +248,7 @@ def test_swaying_flow_and_steps_fit_together_in_a_rendered_world(seed):
     camera = (111.2, 111.2, 95.5, 18.5)
     drive = synthetic.drive(seed, 7, height=48, width=192, camera=camera)
     flow, steps = np.stack([drive.flow(index) for index in range(6)]), drive.steps()
-    turns = draw_sway(7, np.random.default_rng(seed))
+    turns = draw_sway(7, np.random.default_rng(seed), most_pan_rad=0.2)
 
     def residual(flow, steps):
         fx, fy, cx, cy = (value / 8 for value in camera)
@@ -265,14 +266,30 @@ def test_swaying_flow_and_steps_fit_together_in_a_rendered_world(seed):
     assert right < 1e-3 * np.linalg.norm(steps[:, :3], axis=1).mean()
 
 
-def test_sway_is_small_of_every_axis_and_never_the_same():
+def test_sway_is_of_every_axis_never_the_same_and_pans_as_fast_as_corners_turn():
     rng = np.random.default_rng(0)
-    steps = np.stack([sway_steps(np.zeros((12, 6)), draw_sway(13, rng)) for _ in range(400)])
+    steps = np.stack([sway_steps(np.zeros((12, 6)), draw_sway(13, rng, most_pan_rad=0.5)) for _ in range(400)])
     deviation_deg = np.rad2deg(steps[..., 3:].std((0, 1)))
-    np.testing.assert_allclose(deviation_deg, [0.27, 0.33, 0.31], atol=0.06)
+    np.testing.assert_allclose(deviation_deg, [0.27, 0.83, 0.31], atol=0.07)
     assert np.abs(steps[..., :3]).max() < 1e-12
-    attitude_deg = np.rad2deg(geometry.log_so3(np.stack([draw_sway(13, rng) for _ in range(400)])))
-    assert attitude_deg.std((0, 1)) == pytest.approx([0.63, 1.1, 0.45], abs=0.2) and np.abs(attitude_deg).max() < 8
+    still = np.rad2deg(geometry.log_so3(np.stack([draw_sway(13, rng, most_pan_rad=0.0) for _ in range(400)])))
+    assert still.std((0, 1)) == pytest.approx([0.63, 0.62, 0.45], abs=0.1) and np.abs(still).max() < 4
+
+
+def test_a_pan_goes_no_further_than_it_may_however_long_the_window():
+    camera = (80.0, 80.0, 63.5, 23.5)
+    most_rad = most_pan(camera, 128)
+    assert np.tan(most_rad) * camera[0] == pytest.approx(128 / 4)
+
+    def end_to_end_rad(count, seed):
+        turns = draw_sway(count, np.random.default_rng(seed), most_pan_rad=most_rad)
+        return np.diff(geometry.log_so3(turns[[0, -1]])[:, 1])[0]
+
+    swung_deg = np.rad2deg(np.abs([[end_to_end_rad(count, seed) / 2 for count in (13, 101)] for seed in range(100)]))
+    # What a window of 13 has no time for is the rule in one of 101; the sway itself adds a degree or two.
+    limit_deg = np.rad2deg(most_rad)
+    assert (swung_deg < limit_deg + 1.5).all()
+    assert (swung_deg[:, 0] > limit_deg - 1.5).mean() < 0.05 and (swung_deg[:, 1] > limit_deg - 1.5).mean() > 0.4
 
 
 def test_a_swaying_drive_has_its_frames_and_poses_turned_alike():
