@@ -61,16 +61,12 @@ def mirror_flow(flow: np.ndarray, camera: Camera | None) -> np.ndarray:
     Cell i of the map sees pixel 8 i, so its mirror `2 cx - 8 i` lies between cells: the two about it are blended. NaN
     where one of them is not known or not on the map. Without a `camera` there is no saying where: all NaN.
     """
-    width = flow.shape[-2]
     if camera is None:
         return np.full_like(flow, np.nan)
-    place = 2 * camera[2] / FLOW_STRIDE - np.arange(width)
-    left = np.floor(place).astype(int)
-    share = (place - left)[:, None]
-    known = (left >= 0) & (left + (share[:, 0] > 0) < width)
-    first, second = (flow[..., np.clip(column, 0, width - 1), :] for column in (left, left + 1))
-    blended = np.where(share > 0, (1 - share) * first + share * second, first) * (-1.0, 1.0)
-    return np.where(known[:, None], blended, np.nan).astype(flow.dtype)
+    height, width = flow.shape[-3:-1]
+    v, u = np.mgrid[:height, :width].astype(float)
+    mirrored = _flow_at(flow, np.stack([2 * camera[2] / FLOW_STRIDE - u, v], -1)) * (-1.0, 1.0)
+    return mirrored.astype(flow.dtype)
 
 
 def narrow(frames: np.ndarray, rng: np.random.Generator) -> np.ndarray:
@@ -137,19 +133,8 @@ def sway_flow(flow: np.ndarray, camera: Camera, rotations: np.ndarray) -> np.nda
     v, u = np.mgrid[:height, :width].astype(float)
     cells = np.stack([u, v], -1)
     source = _through(maps[:-1, None, None], cells)
-    corner = np.floor(source)
-    share = source - corner
-    column, row = np.moveaxis(corner.astype(int), -1, 0)
-    step = np.arange(len(flow))[:, None, None]
-    blended = np.zeros(flow.shape)
-    for down in (0, 1):
-        for right in (0, 1):
-            weight = abs(1 - right - share[..., 0]) * abs(1 - down - share[..., 1])
-            inside = (row + down >= 0) & (row + down < height) & (column + right >= 0) & (column + right < width)
-            value = flow[step, np.clip(row + down, 0, height - 1), np.clip(column + right, 0, width - 1)]
-            value = np.where(inside[..., None], value, np.nan)
-            blended += np.where(weight[..., None] > 0, weight[..., None] * value, 0)
-    return (_through(np.linalg.inv(maps[1:])[:, None, None], source + blended) - cells).astype(flow.dtype)
+    led = source + _flow_at(flow, source)
+    return (_through(np.linalg.inv(maps[1:])[:, None, None], led) - cells).astype(flow.dtype)
 
 
 def sway_steps(steps: np.ndarray, rotations: np.ndarray) -> np.ndarray:
@@ -209,6 +194,29 @@ def photometric(frames: np.ndarray, strength: float, rng: np.random.Generator) -
         toned = cv2.LUT(frame, tone[None]).reshape(frame.shape)
         result[index] = cv2.add(toned, moved, dtype=cv2.CV_8U).reshape(frame.shape)
     return result
+
+
+def _flow_at(flow: np.ndarray, place: np.ndarray) -> np.ndarray:
+    """Return optical flow `[..., h, w, 2]` at places (column, row) of its map, a `place` for each cell of the result.
+
+    The four cells about a place are blended; NaN where one that counts is not known or not on the map.
+    """
+    height, width = flow.shape[-3:-1]
+    maps = flow.reshape(-1, height, width, 2)
+    places = np.broadcast_to(place, flow.shape).reshape(maps.shape)
+    corner = np.floor(places)
+    share = places - corner
+    column, row = np.moveaxis(corner.astype(int), -1, 0)
+    number = np.arange(len(maps))[:, None, None]
+    blended = np.zeros(maps.shape)
+    for down in (0, 1):
+        for right in (0, 1):
+            weight = abs(1 - right - share[..., 0]) * abs(1 - down - share[..., 1])
+            inside = (row + down >= 0) & (row + down < height) & (column + right >= 0) & (column + right < width)
+            value = maps[number, np.clip(row + down, 0, height - 1), np.clip(column + right, 0, width - 1)]
+            value = np.where(inside[..., None], value, np.nan)
+            blended += np.where(weight[..., None] > 0, weight[..., None] * value, 0)
+    return blended.reshape(flow.shape)
 
 
 def _window_on(frames: np.ndarray, top: int, bottom: int, left: int, right: int) -> np.ndarray:
