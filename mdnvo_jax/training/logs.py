@@ -38,7 +38,7 @@ class Logs:
     def __init__(self, workdir: Path, step: int, *, writes: bool = True) -> None:
         self._csv = workdir / CSV
         self._writes = writes
-        self._rows = [row for row in read_rows(self._csv) if int(row["step"]) <= step] if writes else []
+        self._rows = read_rows(self._csv, step) if writes else []
         self._tensorboard = workdir / "tensorboard"
         self._next_step = step + 1
         self._events: EventsWriter | None = None
@@ -95,12 +95,12 @@ class Logs:
                 self._events.close()
 
 
-def read_rows(path: Path) -> list[dict[str, str]]:
-    """Return the rows of a metrics file, none where there is no file."""
+def read_rows(path: Path, last_step: float = math.inf) -> list[dict[str, str]]:
+    """Return the rows of a metrics file up to a step, none where there is no file."""
     if not path.exists():
         return []
     with path.open(newline="", encoding="utf-8") as stream:
-        return list(csv.DictReader(stream))
+        return [row for row in csv.DictReader(stream) if int(row["step"]) <= last_step]
 
 
 def _number(value: float) -> str:

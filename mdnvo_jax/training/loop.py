@@ -211,7 +211,7 @@ class _Run:
     def epochs(self, state: State, batches: Any, validation: Any) -> str:
         """Run from where `state` is to the last epoch, or to a signal."""
         started = time.monotonic()
-        past = [row for row in logs.read_rows(self.workdir / logs.CSV) if int(row["step"]) <= self.first_step]
+        past = logs.read_rows(self.workdir / logs.CSV, self.first_step)
         losses = [float(row["validation_loss"]) for row in past]
         patience = self.config.training.early_stop_patience
         with StopRequest().listening() as stop:
