@@ -29,10 +29,11 @@ _NOISE = 4.0
 _NARROW = (0.3, 0.12, 0.25, 0.25)
 # Attitude of a swaying camera about x, y and z (pitch, yaw, roll), as standard deviations: what stays the same over a
 # window, what grows with every frame, and the strength of what swings, each in degrees. The swing is of the size of the
-# rendered cars' own and of any frequency up to half the frame rate: no spring's alone. The growth is as fast as cars
-# turn in corners, at any speed: else a network learns that who turns drives slowly, and reads his speed so.
+# rendered cars' own and of any frequency up to half the frame rate: no spring's alone. What grows are yaws as fast as
+# cars turn in corners, at any speed, for else a network learns that who turns drives slowly and reads his speed so; and
+# pitch and roll slower than springs', as on banked and rolling roads, which it would else read short.
 _SWAY_OFFSET_DEG = (0.6, 0.6, 0.4)
-_SWAY_RATE_DEG = (0.0, 0.8, 0.0)
+_SWAY_RATE_DEG = (0.1, 0.8, 0.15)
 _SWAY_SWING_DEG = (0.2, 0.15, 0.2)
 _SWAY_SINES = 5
 # Rows and columns by which the noise of one frame may be moved against that of another.
@@ -91,7 +92,7 @@ def draw_sway(count: int, rng: np.random.Generator, *, most_pan_rad: float) -> n
     Args:
       count: of the frames.
       rng: decides.
-      most_pan_rad: how far the yaw that grows with every frame may have come at either end; see `most_pan`. 0 for
+      most_pan_rad: how far a rotation that grows with every frame may have come at either end; see `most_pan`. 0 for
         whole drives, over which the camera would look aside.
     """
     frame = np.arange(count) - (count - 1) / 2

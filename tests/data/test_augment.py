@@ -270,7 +270,10 @@ def test_sway_is_of_every_axis_never_the_same_and_pans_as_fast_as_corners_turn()
     rng = np.random.default_rng(0)
     steps = np.stack([sway_steps(np.zeros((12, 6)), draw_sway(13, rng, most_pan_rad=0.5)) for _ in range(400)])
     deviation_deg = np.rad2deg(steps[..., 3:].std((0, 1)))
-    np.testing.assert_allclose(deviation_deg, [0.27, 0.83, 0.31], atol=0.07)
+    np.testing.assert_allclose(deviation_deg, [0.30, 0.84, 0.33], atol=0.05)
+    # What swings is taken back over the window, what grows is not.
+    trend_deg = np.rad2deg(steps[..., 3:].mean(1).std(0))
+    np.testing.assert_allclose(trend_deg, [0.1, 0.8, 0.15], rtol=0.15)
     assert np.abs(steps[..., :3]).max() < 1e-12
     still = np.rad2deg(geometry.log_so3(np.stack([draw_sway(13, rng, most_pan_rad=0.0) for _ in range(400)])))
     assert still.std((0, 1)) == pytest.approx([0.63, 0.62, 0.45], abs=0.1) and np.abs(still).max() < 4
