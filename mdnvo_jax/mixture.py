@@ -259,6 +259,22 @@ def widen(mixture: Mixture, factor: ArrayLike) -> Mixture:
     return Mixture(mixture.logits, centre + factor * (mixture.mean - centre), mixture.log_scale + jnp.log(factor))
 
 
+def add_noise(mixture: Mixture, sigma: ArrayLike) -> Mixture:
+    """Distribution of `y + n` where n ~ N(0, diag(sigma^2)) is independent of y, such as a measurement of y.
+
+    The convolution of the two densities: every component keeps weight and mean, and has the variance of both. `sigma`
+    is `[K]`; ValueError where it is not, or is not a number of 0 or more.
+    """
+    mixture, sigma = _checked(mixture), _float(sigma)
+    expected = mixture.mean.shape[-1:]
+    if sigma.shape != expected:
+        raise ValueError(f"sigma has shape {sigma.shape}; expected {expected}, K of the mixture")
+    _check_positive(sigma, "sigma", or_zero=True)
+    # log sqrt(a^2 + b^2), whose gradient by b is 0, and not NaN, where b is 0.
+    noisy = jnp.logaddexp(2 * mixture.log_scale, 2 * jnp.log(jnp.where(sigma == 0, 1, sigma))) / 2
+    return Mixture(mixture.logits, mixture.mean, jnp.where(sigma == 0, mixture.log_scale, noisy))
+
+
 def crps(mixture: Mixture, value: ArrayLike) -> Array:
     """Continuous ranked probability score, by dimension: E|X - y| - E|X - X'| / 2, in the units of the dimension.
 
@@ -337,11 +353,11 @@ def _check_coupling(coupling: str) -> None:
         raise ValueError(f"coupling is {coupling!r}; expected 'independent' or 'joint'")
 
 
-def _check_positive(array: Array, name: str) -> None:
+def _check_positive(array: Array, name: str, *, or_zero: bool = False) -> None:
     with jax.ensure_compile_time_eval():
-        is_positive = (array > 0).all()
-    if not isinstance(is_positive, jax.core.Tracer) and not is_positive:
-        raise ValueError(f"{name} is {array}; expected positive numbers")
+        is_right = ((array >= 0) if or_zero else (array > 0)).all()
+    if not isinstance(is_right, jax.core.Tracer) and not is_right:
+        raise ValueError(f"{name} is {array}; expected {'numbers of 0 or more' if or_zero else 'positive numbers'}")
 
 
 def _weights(mixture: Mixture) -> Array:

@@ -47,9 +47,10 @@ def weights(mixture: Mixture) -> np.ndarray:
 
 
 # Compiled once a shape: most of the time of these tests would go into compiling operation by operation.
-affine, cdf, crps, interval, mean, quantile, strongest, variance, widen = map(
-    jax.jit, (mx.affine, mx.cdf, mx.crps, mx.interval, mx.mean, mx.quantile, mx.strongest, mx.variance, mx.widen)
+affine, cdf, crps, interval, mean, quantile, strongest, variance = map(
+    jax.jit, (mx.affine, mx.cdf, mx.crps, mx.interval, mx.mean, mx.quantile, mx.strongest, mx.variance)
 )
+add_noise, widen = jax.jit(mx.add_noise), jax.jit(mx.widen)
 covariance, log_prob, mode = (
     jax.jit(function, static_argnames="coupling") for function in (mx.covariance, mx.log_prob, mx.mode)
 )
@@ -156,6 +157,7 @@ PUBLIC: dict[str, Callable[[Mixture, jax.Array], object]] = {
     "sample joint": lambda m, _: mx.sample(m, KEY, (5,), coupling="joint"),
     "affine": lambda m, _: mx.affine(m, np.full(m.mean.shape[-1], 1e3), np.ones(m.mean.shape[-1]))[1:],
     "widen": lambda m, _: mx.widen(m, np.full(m.mean.shape[-1], 1e3))[1:],
+    "add_noise": lambda m, _: mx.add_noise(m, np.full(m.mean.shape[-1], 1e3))[1:],
     "crps": mx.crps,
 }
 
@@ -583,6 +585,40 @@ def test_widening_multiplies_the_deviation_about_the_mean(x64: None) -> None:
     np.testing.assert_allclose(np.exp(found.log_scale), [[3.0], [6.0]], rtol=1e-12)
 
 
+def test_noise_adds_its_variance_to_every_component(x64: None) -> None:
+    """By hand: 3, 4 make 5, and 12, 5 make 13; the density is the integral of the product of the two."""
+    two = Mixture(np.log([0.25, 0.75]), np.array([[-1.0, 0.0], [1.0, 2.0]]), np.log([[3.0, 12.0], [3.0, 12.0]]))
+    sigma, value = np.array([4.0, 5.0]), np.array([0.5, -3.0])
+    found = add_noise(two, sigma)
+    np.testing.assert_allclose(np.exp(found.log_scale), [[5.0, 13.0]] * 2, rtol=1e-12)
+    np.testing.assert_array_equal(found.mean, two.mean)
+    np.testing.assert_array_equal(found.logits, two.logits)
+    noise = np.linspace(-10, 10, 401) * sigma[:, None]
+    weight = np.exp(-((noise / sigma[:, None]) ** 2) / 2) * 0.05 / np.sqrt(2 * np.pi)
+    grid = value - np.stack(np.meshgrid(*noise, indexing="ij"), -1)
+    for coupling in COUPLINGS:
+        density = np.exp(jax.vmap(jax.vmap(lambda y, c=coupling: mx.log_prob(two, y, coupling=c)))(grid))
+        expected = np.einsum("i,j,ij->", *weight, density)
+        np.testing.assert_allclose(np.exp(log_prob(found, value, coupling=coupling)), expected, rtol=1e-9)
+
+
+def test_no_noise_changes_no_bit_and_any_has_finite_gradients() -> None:
+    mixture = device(random_mixture(), "float32")
+    nothing = jnp.zeros(DIMENSIONS)
+    for before, after in zip(mixture, add_noise(mixture, nothing), strict=True):
+        np.testing.assert_array_equal(after, before)
+
+    def total(log_scale: jax.Array, sigma: jax.Array) -> jax.Array:
+        return mx.add_noise(mixture._replace(log_scale=log_scale), sigma).log_scale.sum()
+
+    for sigma in (nothing, jnp.full(DIMENSIONS, 1e-30), jnp.full(DIMENSIONS, 1e30), jnp.array([0.0, 1.0, 0.0])):
+        by_log_scale, by_sigma = jax.grad(total, argnums=(0, 1))(mixture.log_scale, sigma)
+        assert np.isfinite(by_log_scale).all() and np.isfinite(by_sigma).all()
+    by_log_scale, by_sigma = jax.grad(total, argnums=(0, 1))(mixture.log_scale, nothing)
+    np.testing.assert_array_equal(by_log_scale, 1)
+    np.testing.assert_array_equal(by_sigma, 0)
+
+
 def test_widening_is_by_dimension_and_keeps_the_shape(x64: None) -> None:
     mixture, value, factor = random_mixture(), random_value(), np.array([0.25, 1.0, 8.0])
     original, found = device(mixture), widen(device(mixture), factor)
@@ -764,6 +800,9 @@ MISTAKES: dict[str, tuple[Callable[[], object], str]] = {
     "widen scalar": (lambda: mx.widen(GOOD, 2.0), r"factor has shape \(\); expected \(3,\)"),
     "widen batch": (lambda: mx.widen(GOOD, jnp.ones((2, 3, 3))), r"\(2, 3, 3\); expected \(3,\)"),
     "widen sign": (lambda: mx.widen(GOOD, jnp.array([1.0, -1, 1])), "factor is .*expected positive"),
+    "noise shape": (lambda: mx.add_noise(GOOD, 0.1), r"sigma has shape \(\); expected \(3,\)"),
+    "noise sign": (lambda: mx.add_noise(GOOD, jnp.array([1.0, -1, 0])), "sigma is .*expected numbers of 0 or more"),
+    "noise of no number": (lambda: mx.add_noise(GOOD, jnp.array([1.0, jnp.nan, 0])), "expected numbers of 0 or more"),
     "outputs of another size": (
         lambda: mx.from_network(jnp.ones(12), 1, floor=1.0),
         r"\(12,\); expected \[\.\.\., 13\]",

@@ -90,7 +90,7 @@ def calibration_rows(
     return rows, scores
 
 
-def calibration_table(rows: Sequence[CalibrationRow]) -> Table:
+def calibration_table(rows: Sequence[CalibrationRow], notes: Sequence[str] = ()) -> Table:
     """Return one row a method: what concerns the whole 6-vector."""
     columns = (
         *_ABOUT,
@@ -117,6 +117,7 @@ def calibration_table(rows: Sequence[CalibrationRow]) -> Table:
         for row in rows
     ]
     notes = (
+        *notes,
         "NLL in metres and radians. Intervals, coverage and NLL are those of the density's CDF, no Gaussian stands in.",
         "Spearman: rank correlation of sigma with the absolute error; '-' where sigma never varies. "
         "AUSE: area under the sparsification error, 0 is the ranking by the errors themselves.",
@@ -124,7 +125,7 @@ def calibration_table(rows: Sequence[CalibrationRow]) -> Table:
     return Table("Calibration of the predicted steps", columns, body, CONTEXT, group="split", notes=notes)
 
 
-def component_table(rows: Sequence[CalibrationRow]) -> Table:
+def component_table(rows: Sequence[CalibrationRow], notes: Sequence[str] = ()) -> Table:
     """Return a row a method and component."""
     columns = (
         *_ABOUT,
@@ -148,7 +149,7 @@ def component_table(rows: Sequence[CalibrationRow]) -> Table:
             crps = Value(1e3 * float(row.found.crps.value[k]))
             group = f"{row.split} {component}"
             body.append({**_about(row), "component": component, **inside, "crps": crps, **ranks, "group": group})
-    return Table("Calibration by component", columns, body, CONTEXT, group="group")
+    return Table("Calibration by component", columns, body, CONTEXT, group="group", notes=notes)
 
 
 def calibration_data(row: CalibrationRow) -> dict[str, Any]:

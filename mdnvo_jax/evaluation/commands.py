@@ -56,6 +56,9 @@ def parser() -> Parser:
     add("--estimate", choices=("mean", "strongest"), default="mean", help="what a mixture is reported by [%(default)s]")
     add("--scale-sigma", type=float, metavar="SHARE", help="1-sigma error of each path's scale [fitted, or 0]")
     add("--no-recalibration", action="store_true", help="sigmas as the network gave them")
+    reference_help = "1 sigma of the reference's own errors in a step, m and deg: steps are judged as seen through them"
+    six = ("TX", "TY", "TZ", "RX", "RY", "RZ")
+    add("--reference-sigma", type=float, nargs=6, metavar=six, help=reference_help)
     _add_common(model)
     _add_recalibrate(subcommands)
     _add_paper(subcommands)

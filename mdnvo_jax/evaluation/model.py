@@ -21,7 +21,8 @@ from mdnvo_jax.evaluation.drift import Drift
 from mdnvo_jax.evaluation.formats import PoseFile
 from mdnvo_jax.evaluation.report import CalibrationPictures, PathPicture, Report, UncertaintyPicture
 from mdnvo_jax.evaluation.scoring import PathScore
-from mdnvo_jax.odometry import Trajectory, trajectory
+from mdnvo_jax.mixture import Mixture, add_noise
+from mdnvo_jax.odometry import COMPONENTS, Trajectory, trajectory
 
 if TYPE_CHECKING:
     from mdnvo_jax.config import Config
@@ -52,6 +53,7 @@ def from_options(options: argparse.Namespace) -> Report:
 
     if options.block < 1:
         raise InputError(f"--block is {options.block}: expected 1 frame or more")
+    reference_sigma = _reference_sigma(options.reference_sigma)
     if options.other_lenses and options.dataset != "synthetic":
         raise InputError(f"--other-lenses is for --dataset synthetic, and this is {options.dataset}: leave it out")
     model = predictor.load(
@@ -75,10 +77,29 @@ def from_options(options: argparse.Namespace) -> Report:
         how += ", swaying camera"
     if scale_sigma := predicted[0].trajectory.scale_sigma:
         how += f", scale known to {100 * scale_sigma:.1f} %"
-    return evaluate(f"model ({how})", predicted, step, block=options.block)
+    return evaluate(f"model ({how})", predicted, step, block=options.block, reference_sigma=reference_sigma)
 
 
-def evaluate(name: str, predicted: Many[Predicted], constant_step: MeanStep, *, block: int) -> Report:
+def _reference_sigma(given: Many[float] | None) -> np.ndarray:
+    """Return what the reference is wrong by, as given in m and degrees: 1 sigma of a step's components, m and rad.
+
+    Raises:
+      InputError: a number is negative, or none.
+    """
+    sigma = np.zeros(len(COMPONENTS)) if given is None else np.array(given, float)
+    if not (np.isfinite(sigma) & (sigma >= 0)).all():
+        raise InputError(f"--reference-sigma {' '.join(map(str, sigma))}: expected six numbers of 0 or more")
+    return np.where(np.arange(len(sigma)) < 3, sigma, np.deg2rad(sigma))
+
+
+def evaluate(
+    name: str,
+    predicted: Many[Predicted],
+    constant_step: MeanStep,
+    *,
+    block: int,
+    reference_sigma: np.ndarray | None = None,
+) -> Report:
     """Judge predictions, with the constant predictor beside them, by sequence and over all sequences.
 
     Args:
@@ -86,29 +107,33 @@ def evaluate(name: str, predicted: Many[Predicted], constant_step: MeanStep, *, 
       predicted: of each sequence.
       constant_step: mean and deviation of the training split's steps.
       block: frames in a bootstrap block.
+      reference_sigma: standard deviation of the reference's own errors in a step, `[6]`, m and rad. Then the densities
+        of steps are judged as those of the reference, `mixture.add_noise`; paths and drift are not changed by it.
     """
+    reference_sigma = np.zeros(len(COMPONENTS)) if reference_sigma is None else reference_sigma
     pairs = [_score(name, item, constant_step) for item in predicted]
     drifts = [row for item in predicted for row in _drifts(name, item, constant_step)]
     rows: list[CalibrationRow] = []
     if len(predicted) > 1:
         for item in predicted:
-            rows += _calibrations(name, item.name, [item], constant_step, block)[0]
+            rows += _calibrations(name, item.name, [item], constant_step, block, reference_sigma)[0]
         model_scores, floors = zip(*pairs, strict=True)
         pairs.append((scoring.pool(model_scores, _ALL), scoring.pool(floors, _ALL)))
     split = _ALL if len(predicted) > 1 else predicted[0].name
-    found, scores = _calibrations(name, split, predicted, constant_step, block)
+    found, scores = _calibrations(name, split, predicted, constant_step, block, reference_sigma)
     rows += found
     entries = [entry for score, floor in pairs for entry in ((score, floor), (floor, None))]
     table, summaries = scoring.comparison("Pose error", entries, [f"{CONSTANT}: {constant_step.source}"], block=block)
     sequences = ", ".join(item.name for item in predicted)
     calibrations = [tabled.calibration_data(row) for row in rows]
+    notes = _reference_notes(reference_sigma)
     means = []
     if len(predicted) > 1:
         paths, scored = ([item for item in found if item["split"] != _ALL] for found in (summaries, calibrations))
         means.append(drift.means_table(paths, scored, drifts))
     return Report(
-        [table, tabled.calibration_table(rows), drift.drift_table(drifts), *means],
-        [*scoring.segment_tables(summaries), tabled.component_table(rows)],
+        [table, tabled.calibration_table(rows, notes), drift.drift_table(drifts), *means],
+        [*scoring.segment_tables(summaries), tabled.component_table(rows, notes)],
         {
             "paths": summaries,
             "calibration": calibrations,
@@ -136,6 +161,14 @@ def evaluate(name: str, predicted: Many[Predicted], constant_step: MeanStep, *, 
     )
 
 
+def _reference_notes(sigma: np.ndarray) -> list[str]:
+    """Return what tables of calibration say of the reference's own errors, m and rad, `[6]`."""
+    if not sigma.any():
+        return []
+    translation, rotation = (" ".join(f"{value:g}" for value in part) for part in (sigma[:3], np.rad2deg(sigma[3:])))
+    return [f"Judged as densities of a reference that is wrong by {translation} m and {rotation} deg a step (1 sigma)."]
+
+
 def _score(name: str, item: Predicted, constant_step: MeanStep) -> tuple[PathScore, PathScore]:
     """Judge a prediction of one sequence, and the constant predictor on it."""
     frames = np.arange(len(item.truth))
@@ -161,15 +194,19 @@ def track(chunks: Iterator[Any], total: int, *, name: str) -> Iterator[Any]:
 
 
 def _calibrations(
-    name: str, split: str, predicted: Many[Predicted], step: MeanStep, block: int
+    name: str, split: str, predicted: Many[Predicted], step: MeanStep, block: int, reference_sigma: np.ndarray
 ) -> tuple[list[CalibrationRow], StepScores]:
     """Calibrate the model and the constant predictor; the scores are those of the model's whole mixture."""
+
+    def as_referred(density: Mixture) -> Mixture:
+        return add_noise(density, reference_sigma) if reference_sigma.any() else density
+
     truths = [true_steps(item.truth) for item in predicted]
     frames = sum(len(item.truth) for item in predicted)
     rows, scores = tabled.calibration_rows(
         name,
         split,
-        [(item.trajectory.mixture, truth) for item, truth in zip(predicted, truths, strict=True)],
+        [(as_referred(item.trajectory.mixture), truth) for item, truth in zip(predicted, truths, strict=True)],
         coupling=predicted[0].trajectory.coupling,
         frames=(frames, frames),
         block=block,
@@ -177,7 +214,7 @@ def _calibrations(
     floor, _ = tabled.calibration_rows(
         CONSTANT,
         split,
-        [(constant.constant_mixture(step.mean, step.std, len(truth)), truth) for truth in truths],
+        [(as_referred(constant.constant_mixture(step.mean, step.std, len(truth))), truth) for truth in truths],
         coupling="independent",
         frames=(frames, frames),
         block=block,

@@ -86,6 +86,31 @@ def test_one_sequence_needs_no_row_over_all():
     assert [row["split"] for row in found.tables[1].rows] == ["03", "03"]
 
 
+def test_a_noisy_reference_is_judged_as_one():
+    """Right sigmas hold too few of the steps that a noisy reference gives, and the right number once that is known."""
+    item = prediction("03", 400, 0.02, 0)
+    noise = np.array([0.04, 0.0, 0.0, 0.0, 0.0008, 0.0])
+    rng = np.random.default_rng(1)
+    noisy = geometry.matrix_to_step(geometry.relative_steps(item.truth)) + noise * rng.standard_normal((400, 6))
+    item = model.Predicted("03", item.trajectory, geometry.accumulate(geometry.step_to_matrix(noisy)))
+    plain, told = (
+        model.evaluate("model", [item], MEAN_STEP, block=10, reference_sigma=sigma) for sigma in (None, noise)
+    )
+    inside = [
+        {name: share.value for name, share in found.results["calibration"][0]["coverage"]["1 sigma"].items()}
+        for found in (plain, told)
+    ]
+    for component in ("tx", "ry"):
+        assert inside[0][component] < 0.45 and inside[1][component] == pytest.approx(0.683, abs=0.08)
+    for component in ("ty", "tz", "rx", "rz"):
+        assert inside[0][component] == inside[1][component]
+    assert plain.tables[1].rows[0]["nees"].value > 8
+    assert told.tables[1].rows[0]["nees"].value == pytest.approx(6, abs=0.6)
+    # Poses and their drift are what they were.
+    for table in (0, 2):
+        assert str(told.tables[table].rows) == str(plain.tables[table].rows)
+
+
 @pytest.fixture(scope="module")
 def workdir(tmp_path_factory):
     """An untrained model, saved as a training would."""
@@ -149,6 +174,16 @@ def test_a_camera_that_sways_has_other_poses_to_find(workdir, root, tmp_path):
     assert 0.03 < rotation_deg("--sway") - rotation_deg() < 1
 
 
+def test_the_noise_of_the_reference_is_given_in_metres_and_degrees(workdir, root, tmp_path):
+    sigma = ["0.01", "0", "0", "0.041", "0.03", "0.05"]
+    given = ("--root", root, "--sequences", "06", "--checkpoint", workdir, "--output", tmp_path / "out")
+    assert run(*given, "--reference-sigma", *sigma) == 0
+    tables = json.loads((tmp_path / "out" / "results.json").read_text(encoding="utf-8"))["tables"]
+    noted = {table["title"]: any("0.01 0 0 m and 0.041 0.03 0.05 deg" in n for n in table["notes"]) for table in tables}
+    assert noted["Calibration of the predicted steps"] and noted["Calibration by component"]
+    assert sum(noted.values()) == 2
+
+
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
@@ -160,6 +195,10 @@ def test_a_camera_that_sways_has_other_poses_to_find(workdir, root, tmp_path):
         (["--root", "{root}", "--sequences", "11"], "no poses at"),
         (["--root", "{root}", "--sequences", "99"], "no sequence 99"),
         (["--root", "{root}", "--sequences", "06", "--block", "0"], "--block is 0"),
+        (
+            ["--reference-sigma", *["1", "0", "0", "0", "0", "-1"], "--sequences", "06"],
+            "expected six numbers of 0 or more",
+        ),
         (["--root", "{root}", "--sequences", "06", "--checkpoint", "absent"], "absent"),
     ],
 )
