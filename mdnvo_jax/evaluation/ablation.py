@@ -30,7 +30,7 @@ VARIANTS: Mapping[str, Sequence[str]] = {
     "window of 4 steps": ("--data.window", "4", "--training.batch_size", "24"),
     "window of 24 steps": ("--data.window", "24", "--training.batch_size", "4"),
     "no optical flow": ("--model.flow_weight", "0"),
-    "a swaying camera": ("--data.sway", "0.4"),
+    "a camera that sways and pans": ("--data.sway", "0.4"),
 }
 # What is compared: the columns of metrics.csv, their headers, and digits.
 _MEASURED = (
