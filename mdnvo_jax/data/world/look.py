@@ -37,6 +37,7 @@ class Look(NamedTuple):
     paint: Array
     wear: Array
     roughness: Array
+    history: Array
     cracks: Array
     patches: Array
     zebra: Array

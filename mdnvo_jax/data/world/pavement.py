@@ -132,17 +132,17 @@ def _asphalt(world: Vector, s: Array, d: Array, along: Array, across: Array, str
     repair = hashed(cell, look.seed + 11)
     there = hashed(cell, look.seed + 12)
     inside = pulses(patch_s, 0.9, along / 7.0) * pulses(patch_d, 0.85, across / 1.7)
-    factor = 1 + 0.35 * repair * (there > 1 - look.patches) * inside
-    factor -= 0.08 * pulses(2 * d / look.lane_m, 0.5, 2 * across / look.lane_m)
+    change = 0.35 * repair * (there > 1 - look.patches) * inside
+    change -= 0.08 * pulses(2 * d / look.lane_m, 0.5, 2 * across / look.lane_m)
     streak = value_noise((s / 8, d * 2.5), look.seed + 13)
-    factor += 0.1 * streak * visible(jnp.maximum(across * 2.5, along / 8))
-    factor -= 0.35 * band(d, -0.025, 0.025, across)
+    change += 0.1 * streak * visible(jnp.maximum(across * 2.5, along / 8))
+    change -= 0.35 * band(d, -0.025, 0.025, across)
     ridge = value_noise((world[0] / 1.4, world[2] / 1.4), look.seed + 14)
     ridge += 0.5 * value_noise((world[0] / 0.4, world[2] / 0.4), look.seed + 15)
     where = value_noise((world[0] / 6, world[2] / 6), look.seed + 16)
     crack = band(ridge, -0.03, 0.03, 1.5 * stretched_m) * (where > 1 - 1.6 * look.cracks)
     stones = lax.cond(look.stone_m > 0, _stones, lambda s, *_: jnp.ones_like(s), s, d, along, across, look)
-    return factor * (1 - 0.65 * crack) * stones
+    return (1 + look.history * change) * (1 - 0.65 * look.history * crack) * stones
 
 
 def _stones(s: Array, d: Array, along: Array, across: Array, look: Look) -> Array:

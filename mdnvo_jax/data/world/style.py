@@ -30,7 +30,8 @@ class Style(NamedTuple):
       clouds: cover, 0 to 1. haze_m: distance at which a 1/e of the contrast is left.
       centre_line, lane_period_m, lane_duty, edge_line, paint, wear: road markings: 0 none, 1 dashed, 2 solid; length of
         a dash and gap; share of the dash; whether edges are marked; reflectance; how worn.
-      roughness: contrast of the asphalt. cracks, patches: how many. zebra: chance of a crossing every 60 m.
+      roughness: contrast of the asphalt. history: how much its repairs, tracks, seams and cracks show, 0 to 1. cracks,
+        patches: how many. zebra: chance of a crossing every 60 m.
       backdrop_rad: how high the distant trees or houses stand.
       daylight: brightness of the sky's colours, 1 by day. headlight, lamps: strength of the car's own headlights and of
         street lamps, 0 by day.
@@ -76,6 +77,7 @@ class Style(NamedTuple):
     paint: float
     wear: float
     roughness: float
+    history: float
     cracks: float
     patches: float
     zebra: float
@@ -128,6 +130,10 @@ def draw_style(seed: int) -> Style:
     surface = stream(seed, "surface")
     cobbles, gravel = (bool(surface.random() < share) for share in (0.2 * town, 0.12 * (cruise < 14) * (1 - town)))
     marked = not (cobbles or gravel)
+    # New asphalt shows next to nothing from a car: else a network would learn that who sees no ground move is slow.
+    cover = stream(seed, "cover")
+    new = bool(cover.random() < 0.4) and marked
+    plainness = cover.uniform(0.1, 0.5) if new else 1.0
     sky_strength = 1 - sun_strength - (0.1 if overcast else 0.0)
     haze = np.exp(rng.uniform(np.log(300), np.log(3000)))
     return Style(
@@ -167,7 +173,8 @@ def draw_style(seed: int) -> Style:
         edge_line=bool(as_motorway or rng.random() < 0.5 * (1.2 - town)) and marked,
         paint=rng.uniform(0.4, 0.8),
         wear=rng.uniform(0.1, 0.9),
-        roughness=rng.uniform(0.12, 0.45) + 0.25 * gravel,
+        roughness=plainness * rng.uniform(0.12, 0.45) + 0.25 * gravel,
+        history=cover.uniform(0, 0.6) if new else 1.0,
         cracks=rng.random() * (0.4 + 0.6 * town),
         patches=rng.random() * (0.4 + 0.6 * town),
         zebra=0.25 * town * rng.random(),
