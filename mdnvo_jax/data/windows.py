@@ -18,6 +18,8 @@ from mdnvo_jax.model.network import flow_size
 
 # Least standard deviation of a label (m, then rad): dividing by less would blow up a dimension that hardly varies.
 STD_FLOOR = np.array([1e-3] * 3 + [1e-4] * 3)
+# A window stands whose camera moves by less from each frame to the next: 0.4 m/s at ten frames a second.
+_STANDS_M = 0.04
 # Batches that are read ahead for each thread.
 _AHEAD_PER_THREAD = 2
 
@@ -270,7 +272,9 @@ def _training_window(
             flow = np.stack([sequence.flow(int(index)) for index in indices[:-1]])
     camera = cameras[0]
     if camera is not None and data.sway > 0 and rng.random() < data.sway:
-        most_pan = augment.most_pan(camera, frames[0].shape[1])
+        # Cars turn by driving: a camera that pans where nothing moves would only teach to doubt that it stands.
+        stands = np.abs(labels[:, :3]).max() < _STANDS_M
+        most_pan = 0.0 if stands else augment.most_pan(camera, frames[0].shape[1])
         rotations = augment.draw_sway(steps + 1, rng, most_pan_rad=most_pan)
         frames = list(augment.sway_frames(np.stack(frames), camera, rotations))
         labels = augment.sway_steps(labels, rotations)

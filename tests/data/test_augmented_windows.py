@@ -140,3 +140,19 @@ def test_swaying_windows_have_swaying_frames_labels_and_flow(toy):
     # Without intrinsics nobody can say what a turned camera sees.
     unknown = taken(windows.training_batches([dataclasses.replace(sequence, camera=None)], config, seed=0), 1)[0]
     np.testing.assert_array_equal(unknown["steps"], plain["steps"])
+
+
+def test_a_window_that_stands_sways_and_does_not_pan(toy):
+    camera = (9.0, 9.0, 7.5, 3.5)
+    config = config_of(image=dataclasses.replace(IMAGE, camera=camera), batch_size=100, window=8, sway=1.0)
+
+    def trend_deg(speed_m):
+        poses = np.tile(np.eye(4), (200, 1, 1))
+        poses[:, 2, 3] = speed_m * np.arange(200)
+        sequence = toy(200, poses=poses, camera=camera)
+        steps = taken(windows.training_batches([sequence], config, seed=0), 1)[0]["steps"][..., 3:]
+        assert (np.abs(steps).max((0, 1)) > 1e-3).all()
+        return np.rad2deg(steps.mean(1).std(0))
+
+    assert (trend_deg(0.0) < 0.09).all()
+    assert (trend_deg(0.5) > (0.08, 0.6, 0.12)).all()

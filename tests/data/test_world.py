@@ -126,6 +126,16 @@ def test_roads_wind_in_towns_and_in_the_open_alike():
     assert np.mean(np.array(others) < 0.16) < 0.25
 
 
+def test_some_roads_show_as_little_of_themselves_as_new_asphalt_does():
+    styles = [draw_style(seed) for seed in range(1000)]
+    new = [style for style in styles if style.history < 1]
+    assert 0.2 < len(new) / len(styles) < 0.4
+    # Cobbles and gravel are never new asphalt, whatever else the road is.
+    assert all(style.stone_m == 0 and style.roughness < 0.23 for style in new)
+    assert np.median([style.roughness for style in new]) < 0.12
+    assert min(style.roughness for style in styles if style.history == 1) >= 0.12
+
+
 def test_speeds_are_flat_and_standing_still_is_among_them(paths):
     cruise = np.array([draw_style(seed).cruise_mps for seed in range(1000)])
     assert 0.02 < (cruise == 0).mean() < 0.06 and cruise.max() > 29
