@@ -265,3 +265,29 @@ def test_cars_have_a_greenhouse_and_vans_hide_it():
     assert ((cabin.bottom_m + 2 * cabin.half[:, 1])[~big] < 1.7).all()
     assert (lights.half[:, 2] > body.half[:, 2]).all() and (lights.half[:, 0] < body.half[:, 0]).all()
     assert (lights.bottom_m + 2 * lights.half[:, 1] < body.bottom_m + 2 * body.half[:, 1]).all()
+
+
+def test_dry_asphalt_mirrors_the_sun_where_it_stands_ahead(day):
+    """The ground brightens towards the sun, the sky does not, and away from the sun nothing changes."""
+    ahead = day.poses[0, :3, 2] * (1, 0, 1)
+
+    def gain(towards, sheen):
+        sun = towards * np.cos(0.5) / np.linalg.norm(towards) + np.array([0, -np.sin(0.5), 0])
+        style = day.style._replace(sun=sun, sun_strength=0.7, sky_strength=0.3, sheen=0.0)
+        before, after = (picture(day, style=style._replace(sheen=value)).astype(float) for value in (0.0, sheen))
+        return (after + 1) / (before + 1)
+
+    facing, away = gain(ahead, 0.3), gain(-ahead, 0.3)
+    road = np.s_[-40:, WIDTH // 2 - 40 : WIDTH // 2 + 40]
+    assert facing[road].mean() > 1.15 and facing[: HEIGHT // 4].max() < 1.02
+    np.testing.assert_allclose(away, 1, atol=0.02)
+
+
+def test_new_asphalt_shows_little_of_itself(day):
+    road = np.s_[-40:, WIDTH // 2 - 40 : WIDTH // 2 + 40]
+
+    def contrast(**cover):
+        frame = picture(day, style=day.style._replace(arrows=0.0, zebra=0.0, stone_m=0.0, **cover))[road].astype(float)
+        return (frame - cv2.GaussianBlur(frame, (0, 0), 6)).std() / frame.mean()
+
+    assert contrast(roughness=0.02, history=0.1) < 0.4 * contrast(roughness=0.3, history=1.0)

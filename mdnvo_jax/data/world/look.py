@@ -38,6 +38,7 @@ class Look(NamedTuple):
     wear: Array
     roughness: Array
     history: Array
+    sheen: Array
     cracks: Array
     patches: Array
     zebra: Array

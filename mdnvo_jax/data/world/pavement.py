@@ -34,12 +34,16 @@ class Lane(NamedTuple):
 
 
 class Floor(NamedTuple):
-    """What the ground is made of: colour, contrast of its texture, share of paint on it, how it shines, 0 to 1."""
+    """What the ground is made of: colour, contrast of its texture, share of paint on it, how it shines, 0 to 1.
+
+    Water shines as a mirror does (`shine`), dry asphalt with the sun alone, blurred (`sheen`).
+    """
 
     colour: Colour
     contrast: Array
     painted: Array
     shine: Array
+    sheen: Array
 
 
 def road_coordinates(x: Array, z: Array, lane: Lane) -> tuple[Array, Array, Array]:
@@ -112,7 +116,9 @@ def pave(point: Vector, view: View, stretched_m: Array, noise: Array, lane: Lane
     fresh = jnp.clip(1 - look.wear * (0.35 + 0.8 * noise), 0, 1)
     # Water stands in ruts and hollows.
     shine = look.wet * jnp.maximum(asphalt, walk) * jnp.clip(0.6 + 0.8 * (1 - wear) - 0.5 * noise, 0, 1)
-    return Floor(tuple(colour), mix(0.6, look.roughness, asphalt) - 0.35 * walk, painted * fresh, shine)
+    return Floor(
+        tuple(colour), mix(0.6, look.roughness, asphalt) - 0.35 * walk, painted * fresh, shine, look.sheen * asphalt
+    )
 
 
 def _side_roads(point: Vector, lane: Lane, footprint: Array) -> Array:

@@ -18,6 +18,8 @@ from mdnvo_jax.data.world.trace import BOXES, GROUND, SKY, Hit, Shapes
 # Share of a pixel that counts when textures fade: a little less than all, like a sharp lens.
 _SHARPNESS = 0.8
 _OCTAVES, _GAIN = 5, 1.0
+# Exponent of the lobe in which dry asphalt mirrors the sun: half of it within 15 degrees.
+_GLOSS = 20.0
 
 
 class Surface(NamedTuple):
@@ -84,6 +86,7 @@ def radiance(
     glow = paint.glow[row] * skin.pane * skin.glint**4 * (look.headlight > 0)
     # Schlick's formula for water, at the angle of the eye.
     mirror = jnp.where(ground, floor.shine * (0.02 + 0.4 * (1 - jnp.clip(facing, 0, 1)) ** 5), 0)
+    sheen = jnp.where(ground, floor.sheen * _glint(view.towards, look), 0) * direct
     clearness = jnp.exp(-jnp.minimum(view.distance_m, 1e4) / look.haze_m)
     heaven = sky.heaven(view, far, noise, look)
     colour = []
@@ -92,10 +95,17 @@ def radiance(
         wall = mix(wall, paint.window[:, c][row] * skin.glint, skin.pane)
         albedo = jnp.where(ground, mix(floor.colour[c] * texture, look.paint, floor.painted), wall)
         air = 0.8 * look.daylight * look.colours[5, c]
-        seen = albedo * (direct * look.colours[6, c] + diffuse + lamps) + glow
+        seen = albedo * (direct * look.colours[6, c] + diffuse + lamps) + glow + sheen * look.colours[6, c]
         seen = mix(seen, air, mirror)
         colour.append(jnp.where(away, heaven[c], mix(air, seen, clearness)))
     return tuple(colour)
+
+
+def _glint(towards: Vector, look: Look) -> Array:
+    """Return how far a level, rough ground mirrors the sun to the eye, 0 to 1: Blinn's lobe about the half vector."""
+    half = [s - t for s, t in zip(look.sun, towards, strict=True)]
+    length = jnp.sqrt(half[0] ** 2 + half[1] ** 2 + half[2] ** 2) + 1e-6
+    return jnp.maximum(-half[1] / length, 0) ** _GLOSS
 
 
 def _surface(hit: Hit, view: View, shapes: Shapes, paint: Paint, row: Array, look: Look) -> Surface:

@@ -30,8 +30,8 @@ class Style(NamedTuple):
       clouds: cover, 0 to 1. haze_m: distance at which a 1/e of the contrast is left.
       centre_line, lane_period_m, lane_duty, edge_line, paint, wear: road markings: 0 none, 1 dashed, 2 solid; length of
         a dash and gap; share of the dash; whether edges are marked; reflectance; how worn.
-      roughness: contrast of the asphalt. history: how much its repairs, tracks, seams and cracks show, 0 to 1. cracks,
-        patches: how many. zebra: chance of a crossing every 60 m.
+      roughness: contrast of the asphalt. history: how much its repairs, tracks, seams and cracks show, 0 to 1. sheen:
+        how it mirrors the sun. cracks, patches: how many. zebra: chance of a crossing every 60 m.
       backdrop_rad: how high the distant trees or houses stand.
       daylight: brightness of the sky's colours, 1 by day. headlight, lamps: strength of the car's own headlights and of
         street lamps, 0 by day.
@@ -78,6 +78,7 @@ class Style(NamedTuple):
     wear: float
     roughness: float
     history: float
+    sheen: float
     cracks: float
     patches: float
     zebra: float
@@ -175,6 +176,7 @@ def draw_style(seed: int) -> Style:
         wear=rng.uniform(0.1, 0.9),
         roughness=plainness * rng.uniform(0.12, 0.45) + 0.25 * gravel,
         history=cover.uniform(0, 0.6) if new else 1.0,
+        sheen=cover.uniform(0, 0.35) if new else 0.0,
         cracks=rng.random() * (0.4 + 0.6 * town),
         patches=rng.random() * (0.4 + 0.6 * town),
         zebra=0.25 * town * rng.random(),
