@@ -11,6 +11,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from mdnvo_jax import mixture as density
@@ -28,6 +29,8 @@ RANKED = (*COMPONENTS, "translation", "rotation")
 SIGMA_LEVELS = (0.6827, 0.9545, 0.9973)
 # Draws for statistics that need a sort; the others have `bootstrap.DRAWS`.
 _RANKING_DRAWS = 200
+# Errors of each step that are drawn from its own density.
+_OWN_DRAWS = 50
 # Steps that are scored at a time.
 _CHUNK = 256
 # Factors that `fit_sigma_scale` considers.
@@ -45,6 +48,7 @@ class StepScores:
       error: absolute error of the centre, `[n, K]`, m or rad.
       sigma: standard deviation, `[n, K]`.
       nees: normalised estimation error squared, e^T P^-1 e, `[n]`; its mean is K where covariances are right.
+      drawn: absolute errors as the density itself has them, m or rad: `_OWN_DRAWS` a step, `[n, D, K]`.
     """
 
     pit: np.ndarray
@@ -53,6 +57,7 @@ class StepScores:
     error: np.ndarray
     sigma: np.ndarray
     nees: np.ndarray
+    drawn: np.ndarray
 
     def take(self, indices: np.ndarray) -> "StepScores":
         """Return the rows `indices`."""
@@ -79,6 +84,8 @@ class Calibration:
       crps: mean by component, `[K]`, m or rad.
       nees: mean; K is right, more is over-confident.
       spearman: rank correlation of sigma with the absolute error, by `RANKED`; NaN where sigma never varies.
+      own_spearman: the same of errors drawn from the densities themselves: mean, and the interval of 95 % of draws. It
+        is what `spearman` would be if they were right, and the lower the less sigma varies.
       ause: area under the sparsification error, by `RANKED`; 0 is the best ranking.
     """
 
@@ -88,6 +95,7 @@ class Calibration:
     crps: Estimated
     nees: Estimated
     spearman: Estimated
+    own_spearman: Estimated
     ause: Estimated
 
 
@@ -108,9 +116,15 @@ def score(
     count = len(leaves[-1])
     # Rows beyond the last are copies of it, so that every chunk has one shape and is compiled for once.
     rows = np.minimum(np.arange(-(-count // _CHUNK) * _CHUNK), count - 1).reshape(-1, _CHUNK)
-    chunks = [_measure(*(leaf[chunk] for leaf in leaves), coupling=coupling) for chunk in rows]
-    parts = (np.concatenate([np.asarray(chunk[i], np.float64) for chunk in chunks])[:count] for i in range(5))
-    centre, covariance, pit, nll, crps = parts
+    keys = jax.random.split(jax.random.key(0), len(rows))
+    chunks = [
+        _measure(key, *(leaf[chunk] for leaf in leaves), coupling=coupling)
+        for key, chunk in zip(keys, rows, strict=True)
+    ]
+    parts = (
+        np.concatenate([np.asarray(part, np.float64) for part in found])[:count] for found in zip(*chunks, strict=True)
+    )
+    centre, covariance, pit, nll, crps, drawn = parts
     error = truth - centre
     return StepScores(
         pit=pit,
@@ -119,14 +133,15 @@ def score(
         error=np.abs(error),
         sigma=np.sqrt(np.diagonal(covariance, axis1=1, axis2=2)),
         nees=np.einsum("nk,nk->n", error, np.linalg.solve(covariance, error[..., None])[..., 0]),
+        drawn=np.abs(drawn - centre[:, None]),
     )
 
 
 @functools.partial(jax.jit, static_argnames="coupling")
 def _measure(
-    logits: jax.Array, mean: jax.Array, log_scale: jax.Array, truth: jax.Array, *, coupling: Coupling
+    key: jax.Array, logits: jax.Array, mean: jax.Array, log_scale: jax.Array, truth: jax.Array, *, coupling: Coupling
 ) -> tuple[jax.Array, ...]:
-    """Return mean, covariance, CDF, NLL and CRPS of steps."""
+    """Return mean, covariance, CDF, NLL, CRPS and draws `[n, D, K]` of steps."""
     mixture = Mixture(logits, mean, log_scale)
     return (
         density.mean(mixture),
@@ -134,6 +149,7 @@ def _measure(
         density.cdf(mixture, truth),
         density.nll(mixture, truth, coupling=coupling, reduction="none"),
         density.crps(mixture, truth),
+        jnp.swapaxes(density.sample(mixture, key, (_OWN_DRAWS,), coupling=coupling), 0, 1),
     )
 
 
@@ -169,6 +185,7 @@ def calibrate(scores: StepScores, draws: bootstrap.Draws | None = None) -> Calib
         crps=mean(scores.crps),
         nees=mean(scores.nees),
         spearman=ranking(spearman),
+        own_spearman=_own_spearman(sigma, scores.drawn),
         ause=ranking(area_under_sparsification_error),
     )
 
@@ -211,6 +228,12 @@ def spearman(sigma: np.ndarray, error: np.ndarray) -> np.ndarray:
     spread = np.sqrt((first**2).sum(axis=0) * (second**2).sum(axis=0))
     product = (first * second).sum(axis=0)
     return np.divide(product, spread, out=np.full(spread.shape, np.nan), where=spread > 0)
+
+
+def _own_spearman(sigma: np.ndarray, drawn: np.ndarray) -> Estimated:
+    """Return the correlations of sigma with each set of drawn errors `[n, D, K]`: mean and interval of 95 % of them."""
+    found = np.stack([spearman(sigma, _with_norms(errors)) for errors in np.swapaxes(drawn, 0, 1)])
+    return Estimated(found.mean(axis=0), *np.percentile(found, [2.5, 97.5], axis=0))
 
 
 def sparsification(sigma: np.ndarray, error: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

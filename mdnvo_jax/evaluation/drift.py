@@ -128,6 +128,7 @@ def means_table(
         Column("inside", "in 3 sigma, least of six (%)", 1, "high"),
         Column("spearman_t", "Spearman trans.", 3, "high"),
         Column("spearman_r", "Spearman rot.", 3, "high"),
+        Column("own_t", "of its own draws, trans.", 3),
         Column("nees", "end NEES (6 is right)", 1, 6.0),
     )
     rows: list[Row] = []
@@ -148,6 +149,7 @@ def means_table(
                 "inside": Value(100 * float(np.mean(inside, axis=0).min())),
                 "spearman_t": Value(_mean_of_known([found["spearman"]["translation"].value for found in scores])),
                 "spearman_r": Value(_mean_of_known([found["spearman"]["rotation"].value for found in scores])),
+                "own_t": Value(_mean_of_known([found["own_spearman"]["translation"].value for found in scores])),
                 "nees": Value(_mean_of_known([run.end_nees for run in runs])),
             }
         )

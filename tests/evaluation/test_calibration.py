@@ -97,6 +97,18 @@ class TestCalibrated:
         # |N(0, 1)| scatters log |e| far more than a sigma that varies tenfold spreads it: correlation near 0.5.
         assert np.all((found.spearman.value > 0.4) & (found.spearman.value < 0.7))
         assert np.all(found.ause.value < 0.5)
+        own = found.own_spearman
+        assert np.all((own.low < found.spearman.value) & (found.spearman.value < own.high))
+        # The mean of draws is known better than any one of them.
+        assert np.all(own.high - own.low < 0.1) and np.all(np.abs(own.value - found.spearman.value) < 0.05)
+
+    def test_a_sigma_that_hardly_varies_can_rank_little(self):
+        mixture, truth = gaussian()
+        level = np.log(SCALES) + 0.05 * (mixture.log_scale - np.log(SCALES))
+        found = calibrate(score(mixture._replace(log_scale=level), truth), bootstrap.draw_blocks(STEPS, draws=2))
+        assert np.all(np.abs(found.own_spearman.value) < 0.1)
+        # Were the errors those of the wider densities, their ranks would still follow.
+        assert np.all(found.spearman.value > 0.4)
 
 
 class TestWrongByTwo:
