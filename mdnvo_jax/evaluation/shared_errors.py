@@ -3,6 +3,7 @@
 import numpy as np
 
 from mdnvo_jax.evaluation import optional
+from mdnvo_jax.evaluation.drift import STANDING_M
 
 # Relative standard deviations that `fit_scale_sigma` considers, beside none at all.
 _LEAST_SIGMA, _GREATEST_SIGMA = 1e-4, 4.0
@@ -15,8 +16,10 @@ def scale_error(steps: np.ndarray, covariance: np.ndarray, truth: np.ndarray) ->
 
         e = sum_k p_k^T C_k^-1 (t_k - p_k) / sum_k p_k^T C_k^-1 p_k,   variance 1 / sum_k p_k^T C_k^-1 p_k.
 
-    Errors of steps that are alike for a while count as scale as far as they do not average out over the drive, as they
-    must: `odometry.trajectory` treats all that is not scale as independent.
+    The sums leave out steps that truly stand (below `drift.STANDING_M`): where a car stands and is said to creep, all
+    of the creep is wrong, and no scale would mend it. Errors of steps that are alike for a while count as scale as far
+    as they do not average out over the drive, as they must: `odometry.trajectory` treats all that is not scale as
+    independent.
 
     Args:
       steps: predicted, `[n, 6]`, or their translations `[n, 3]`, m.
@@ -24,10 +27,11 @@ def scale_error(steps: np.ndarray, covariance: np.ndarray, truth: np.ndarray) ->
       truth: of the shape of `steps`.
 
     Returns:
-      (error, variance); (0, infinity) for a drive that is predicted to stand still, which tells nothing.
+      (error, variance); (0, infinity) for a drive that stands still, or is predicted to, which tells nothing.
     """
-    predicted, residual = steps[:, :3], (truth - steps)[:, :3]
-    weighted = np.linalg.solve(covariance[:, :3, :3], predicted[..., None])[..., 0]
+    moves = np.linalg.norm(truth[:, :3], axis=1) >= STANDING_M
+    predicted, residual = steps[moves, :3], (truth - steps)[moves, :3]
+    weighted = np.linalg.solve(covariance[moves, :3, :3], predicted[..., None])[..., 0]
     precision = float((weighted * predicted).sum())
     if precision == 0:
         return 0.0, float("inf")

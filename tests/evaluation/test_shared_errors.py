@@ -55,7 +55,13 @@ def test_its_variance_is_that_of_repeated_drives():
 
 def test_a_drive_that_stands_still_tells_nothing():
     still = np.zeros((5, 6))
-    assert scale_error(still, random_covariances(5), still) == (0, np.inf)
+    creeping = np.tile([0, 0, 0.03, 0, 0, 0], (5, 1))
+    for said, true in ((still, still), (creeping, still), (still, creeping)):
+        assert scale_error(said, random_covariances(5), true) == (0, np.inf)
+    # Nor do the steps in which a drive waits.
+    steps, covariance = RNG.normal(size=(10, 6)), random_covariances(15)
+    waits = np.concatenate([steps, creeping]), covariance, np.concatenate([1.1 * steps, still])
+    assert scale_error(*waits) == scale_error(steps, covariance[:10], 1.1 * steps)
     errors, variances = np.array([0.1, -0.1, 0.1, 0]), np.array([1e-6, 1e-6, 1e-6, np.inf])
     assert fit_scale_sigma(errors, variances) == pytest.approx(fit_scale_sigma(errors[:3], variances[:3]))
     assert fit_scale_sigma(np.zeros(2), np.full(2, np.inf)) == 0
