@@ -6,14 +6,14 @@
 
 Frames of any camera with known intrinsics are brought to one virtual camera: 82 degrees across, as KITTI's, without the
 upper third of the sky. What each choice is worth at a small budget is in BENCHMARKS.md (`bin/ablate` on
-`configs/ablation.py`). The weights that ship had four sittings, each from the one before, which `bin/ship_weights` had
-put into a copy of the repository: this file from scratch on 2,000 worlds, and three times
+`configs/ablation.py`). The weights that ship had five sittings, each from the one before, which `bin/ship_weights` had
+put into a copy of the repository: this file from scratch on 2,000 worlds, and four times
 
     python -m mdnvo_jax.train configs/pretrained.py --workdir runs/next --data.cache CACHE \\
         --training.initial_weights shipped --training.learning_rate 5e-4 --training.epochs 22
 
-(or 20, or 25 epochs) on worlds whose roads wound ever more like real ones, with a camera that swayed in the third and
-panned as well in the fourth. BENCHMARKS.md says which were which.
+(or 20, 24, or 25 epochs) on worlds that came ever closer to real roads, with a camera that swayed from the third on and
+panned as well from the fourth. BENCHMARKS.md says which were which.
 """
 
 from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig, TrainingConfig
@@ -39,7 +39,7 @@ config = Config(
     ),
     data=DataConfig(
         dataset="synthetic",
-        worlds=3600,
+        worlds=5600,
         world_frames=100,
         validation_worlds=40,
         window=12,
