@@ -31,6 +31,7 @@ VARIANTS: Mapping[str, Sequence[str]] = {
     "window of 24 steps": ("--data.window", "24", "--training.batch_size", "4"),
     "no optical flow": ("--model.flow_weight", "0"),
     "a camera that sways and pans": ("--data.sway", "0.4"),
+    "no dropout in the LSTM": ("--model.lstm_dropout", "0"),
 }
 # What is compared: the columns of metrics.csv, their headers, and digits.
 _MEASURED = (
