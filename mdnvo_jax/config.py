@@ -127,6 +127,8 @@ class DataConfig:
     threads: int = 2
     # Worlds and frames of the synthetic data set; validation worlds come on top and are disjoint by seed.
     worlds: int = 64
+    # Seed of the first training world: further training on worlds that weights have not seen yet begins behind theirs.
+    first_world: int = 0
     world_frames: int = 120
     validation_worlds: int = 8
     # Height of the camera above the road that the labels stand for, m; 0: not known, or not one. KITTI's is 1.65.

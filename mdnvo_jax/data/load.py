@@ -24,7 +24,7 @@ def load_split(config: Config) -> tuple[list[Sequence], list[Sequence], ImageCon
     Data set "kitti": the sequences named, from `data.cache` where given, else decoded from `data.root`. Validation is
     `data.validation_sequences`, or else the tail of every training sequence. Data set "nuscenes": the scenes named, and
     for an empty list the split of `nuscenes`, of which scenes that cannot be used (too short, images not on disk) are
-    left out with a line on stderr. Data set "synthetic": worlds of the seeds 0, 1, ... for training and
+    left out with a line on stderr. Data set "synthetic": worlds of the seeds `data.first_world`, ... for training and
     `VALIDATION_SEED`, ... for validation, from the cache where given, else rendered when read (`TEST_SEED`, ... are
     kept for tests of the result).
 
@@ -33,11 +33,17 @@ def load_split(config: Config) -> tuple[list[Sequence], list[Sequence], ImageCon
     """
     data = config.data
     if data.dataset == "synthetic":
-        if min(data.worlds, data.validation_worlds) < 1 or data.worlds > VALIDATION_SEED:
+        if min(data.worlds, data.validation_worlds) < 1:
             raise InputError(
                 f"data.worlds {data.worlds} and data.validation_worlds {data.validation_worlds}: expected 1 or more"
             )
-        seeds = range(data.worlds), range(VALIDATION_SEED, VALIDATION_SEED + data.validation_worlds)
+        behind = data.first_world + data.worlds
+        if data.first_world < 0 or behind > VALIDATION_SEED:
+            raise InputError(
+                f"data.first_world {data.first_world} and data.worlds {data.worlds}: expected seeds from 0 to "
+                f"{VALIDATION_SEED - 1}, for later ones validate"
+            )
+        seeds = range(data.first_world, behind), range(VALIDATION_SEED, VALIDATION_SEED + data.validation_worlds)
         train, validation = (_worlds(part, config) for part in seeds)
     elif data.dataset == "nuscenes":
         train, validation = (

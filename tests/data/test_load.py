@@ -52,6 +52,8 @@ def test_the_cache_takes_the_place_of_the_files(kitti_root, tmp_path):
         ({"train_sequences": ("09",)}, "no sequence 09"),
         ({"dataset": "synthetic", "worlds": 0}, "data.worlds 0"),
         ({"dataset": "synthetic", "validation_worlds": 0}, "data.validation_worlds 0"),
+        ({"dataset": "synthetic", "first_world": -1}, "data.first_world -1 and data.worlds 64: expected seeds from 0"),
+        ({"dataset": "synthetic", "worlds": 3, "first_world": 999_998}, "to 999999, for later ones validate"),
     ],
 )
 def test_mistakes_are_named(kitti_root, data, message):
@@ -93,6 +95,12 @@ def test_synthetic_worlds_are_disjoint_by_seed(asked):
     assert asked == [(seed, 7, 20, 62, 3, None) for seed in (0, 1, 2, 1_000_000, 1_000_001)]
     assert [s.name for s in train] == ["0", "1", "2"] and len(validation) == 2
     assert image.camera == pytest.approx((20.0, 20.0, 15.0, 8.0))
+
+
+def test_training_worlds_count_from_where_the_config_says(asked):
+    config = config_of("", dataset="synthetic", worlds=2, first_world=999_998, world_frames=7, validation_worlds=1)
+    load.load_split(config)
+    assert [seed for seed, *_ in asked] == [999_998, 999_999, 1_000_000]
 
 
 @pytest.mark.parametrize("rectify", [True, False])
