@@ -66,6 +66,10 @@ class ModelConfig:
     head: Literal["mixture", "regression"] = "mixture"
     # Gaussians in the mixture. Not given in the paper.
     components: int = 3
+    # Prediction looks at every pair of frames a second time, left and right exchanged, and gives the two densities in
+    # equal parts (test-time augmentation): better, and less sure where the two disagree, for twice the work. Training,
+    # and the losses it reports, are without it; for trainings that mirror windows (`data.mirror`). Not in the paper.
+    mirrored: bool = False
     # "independent": equations 3 to 5, a product over dimensions. "joint": a mixture of diagonal Gaussians.
     coupling: Literal["independent", "joint"] = "independent"
     # Weight of an auxiliary loss on optical flow, which a 1x1 convolution reads off conv3_1 while training; for data

@@ -25,6 +25,7 @@ Both have the same marginals, so `mean`, `variance`, `cdf`, `quantile`, `interva
 """
 
 import math
+from collections.abc import Sequence
 from typing import Literal, NamedTuple
 
 import jax
@@ -273,6 +274,25 @@ def add_noise(mixture: Mixture, sigma: ArrayLike) -> Mixture:
     # log sqrt(a^2 + b^2), whose gradient by b is 0, and not NaN, where b is 0.
     noisy = jnp.logaddexp(2 * mixture.log_scale, 2 * jnp.log(jnp.where(sigma == 0, 1, sigma))) / 2
     return Mixture(mixture.logits, mixture.mean, jnp.where(sigma == 0, mixture.log_scale, noisy))
+
+
+def pool(mixtures: Sequence[Mixture]) -> Mixture:
+    """Equal parts of several densities of the same batch shape and K: sum_j p_j(y) / J, the linear opinion pool.
+
+    All their components, so that the whole has the mean of the means, and the mean of the variances plus the variance
+    of the means: what the densities disagree about counts as uncertainty (Lakshminarayanan, Pritzel and Blundell, NIPS
+    2017). With `coupling="independent"` it is so dimension by dimension. ValueError where shapes disagree, or there are
+    none.
+    """
+    checked = [_checked(mixture) for mixture in mixtures]
+    shapes = {(mixture.logits.shape[:-1], mixture.mean.shape[-1]) for mixture in checked}
+    if len(shapes) != 1:
+        raise ValueError(f"densities of batch shape and K {sorted(shapes)}; expected one or more, all of one")
+    return Mixture(
+        jnp.concatenate([jax.nn.log_softmax(mixture.logits, axis=-1) for mixture in checked], axis=-1),
+        jnp.concatenate([mixture.mean for mixture in checked], axis=-2),
+        jnp.concatenate([mixture.log_scale for mixture in checked], axis=-2),
+    )
 
 
 def crps(mixture: Mixture, value: ArrayLike) -> Array:

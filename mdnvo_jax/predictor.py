@@ -44,7 +44,8 @@ class Predictor(NamedTuple):
     Attributes:
       config: the experiment it comes from; `config.image` says what frames are brought to.
       model: its parameters as prediction runs them, and the statistics of its labels. (As trained: `trained`.)
-      features: (model, frames `[n+1, H, W, C]` uint8) -> those of the pairs of consecutive frames, `[n, F]`.
+      features: (model, frames `[n+1, H, W, C]` uint8) -> those of the pairs of consecutive frames, `[n, S F]`, of
+        one side or, where the network looks at pairs mirrored as well, of both.
       densities: (model, tail, features, rows, mask) -> (tail, mixtures in metres and radians); see
         `offline.step_densities`.
       stream_start: (model) -> the state of a stream.
@@ -181,7 +182,7 @@ def from_model(
     products: Products = "mixed" if precision == "bfloat16" else "float32"
 
     def features(model: Folded, frames: jax.Array) -> jax.Array:
-        return fold.pair_features(model, frames, config.image, products)
+        return fold.pair_features(model, frames, config.image, config.model, products)
 
     def densities(
         model: Folded, tail: jax.Array, features: tuple[jax.Array, ...], rows: jax.Array, mask: jax.Array
@@ -218,15 +219,15 @@ def _outside(
     stack: Callable[[Any], Any], streaming: Stream, config: Config
 ) -> tuple[Callable[..., Any], Callable[..., Any]]:
     """Return `Predictor.features` and `.stream_step` with a stack that is computed outside JAX."""
-    pairs = jax.jit(lambda frames: fold.stacked_pairs(frames, config.image))
+    pairs = jax.jit(lambda frames: fold.sides(fold.stacked_pairs(frames, config.image), config.image, config.model))
     pair, advance = jax.jit(streaming.pair), jax.jit(streaming.advance)
 
     def features(model: Folded, frames: Any) -> Any:
-        return stack(pairs(frames))
+        return stack(pairs(frames)).reshape(len(frames) - 1, -1)
 
     def step(model: Folded, state: Any, image: Any, usable: Any) -> Any:
         frame, stacked = pair(state, image)
-        return advance(model, state, frame, usable, stack(stacked[None])[0])
+        return advance(model, state, frame, usable, stack(stacked))
 
     return features, step
 
@@ -342,7 +343,7 @@ def _warm_up(predictor: Predictor, mode: Mode, size: int, hop: int) -> None:
 def _offline(predictor: Predictor, count: int, chunks: Iterator[ahead.Chunk], hop: int) -> tuple[Mixture, np.ndarray]:
     """Return the density of every step and which were usable, from overlapping windows."""
     model = predictor.model
-    tail = np.zeros((predictor.config.data.window, fold.gates_size(model)), np.float32)
+    tail = np.zeros((predictor.config.data.window, fold.gates_size(model, predictor.config.model)), np.float32)
     return offline.step_densities(
         functools.partial(predictor.features, model),
         functools.partial(predictor.densities, model),

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 from mdnvo_jax import mixture
 from mdnvo_jax.config import Config
 from mdnvo_jax.mixture import Mixture
+from mdnvo_jax.model import fold
 from mdnvo_jax.model.convolution import Products
-from mdnvo_jax.model.fold import Folded, folded_stack, gates_size, normalised_frames, pair_gates, window_densities
+from mdnvo_jax.model.fold import Folded
 from mdnvo_jax.model.head import Labels
 
 
@@ -21,7 +22,7 @@ class StreamState(NamedTuple):
       image: the last frame as the network reads it, `[H, W, C]` float32.
       usable: whether it was readable.
       seen: whether there was one at all.
-      gates: of the last pairs of frames, oldest first, `[window, G]`: what the LSTM's first layer makes of their
+      gates: of the last pairs of frames, oldest first, `[window, S G]`: what the LSTM's first layer makes of their
         features.
       mask: which of them are real, `[window]`.
       mean: the last estimated step, `[6]`, held where a frame is unusable.
@@ -80,9 +81,9 @@ class Stream(NamedTuple):
       step: (model, state, image, usable) -> (state, step): what a frame `[H, W, C]` uint8 adds; `usable` false says
         that it could not be read.
       pair: (state, image) -> (frame, pair): the first part of a step, the image as the network reads it and the pair
-        `[H, W, 2C]` that it makes with the last.
+        that it makes with the last, `[S, H, W, 2C]` by side, see `fold.sides`.
       advance: (model, state, frame, usable, features) -> (state, step): the last part, after the convolutions have
-        made features `[F]` of the pair.
+        made features `[S, F]` of the pair.
     """
 
     start: Callable[[Folded], StreamState]
@@ -110,23 +111,23 @@ def stream(config: Config, window: int, sigma_scale: jax.Array | None = None, pr
             image=jnp.zeros(shape, jnp.float32),
             usable=jnp.array(False),
             seen=jnp.array(False),
-            gates=jnp.zeros((window, gates_size(model)), jnp.float32),
+            gates=jnp.zeros((window, fold.gates_size(model, config.model)), jnp.float32),
             mask=jnp.zeros(window, bool),
             mean=jnp.asarray(model.labels.mean),
             variance=jnp.zeros(6),
         )
 
     def pair(state: StreamState, image: jax.Array) -> tuple[jax.Array, jax.Array]:
-        frame = normalised_frames(jnp.asarray(image), config.image)
-        return frame, jnp.concatenate([state.image, frame], axis=-1)
+        frame = fold.normalised_frames(jnp.asarray(image), config.image)
+        return frame, fold.sides(jnp.concatenate([state.image, frame], axis=-1)[None], config.image, config.model)
 
     def advance(
         model: Folded, state: StreamState, frame: jax.Array, usable: jax.Array, features: jax.Array
     ) -> tuple[StreamState, StreamStep]:
         pair_usable = state.seen & state.usable & usable
-        gates = jnp.concatenate([state.gates[1:], pair_gates(model, features[None])])
+        gates = jnp.concatenate([state.gates[1:], fold.pair_gates(model, jnp.reshape(features, (1, -1)))])
         mask = jnp.concatenate([state.mask[1:], pair_usable[None]])
-        windows = window_densities(model, gates[None], mask[None], config.model, sigma_scale)
+        windows = fold.window_densities(model, gates[None], mask[None], config.model, sigma_scale)
         seen_step = jax.tree.map(lambda leaf: leaf[0, -1], windows)
         held = held_step(state.mean, state.variance, model.labels, seen_step.logits.shape[-1])
         density = jax.tree.map(lambda seen, other: jnp.where(pair_usable, seen, other), seen_step, held)
@@ -145,6 +146,6 @@ def stream(config: Config, window: int, sigma_scale: jax.Array | None = None, pr
 
     def step(model: Folded, state: StreamState, image: jax.Array, usable: jax.Array) -> tuple[StreamState, StreamStep]:
         frame, stacked = pair(state, image)
-        return advance(model, state, frame, usable, folded_stack(model.stack, stacked[None], products)[0])
+        return advance(model, state, frame, usable, fold.folded_stack(model.stack, stacked, products))
 
     return Stream(start, step, pair, advance)

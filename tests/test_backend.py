@@ -55,6 +55,19 @@ def test_openvino_computes_the_same(model: predictor.Predictor, expected: np.nda
 
 
 @openvino
+@pytest.mark.parametrize("mode", ["offline", "streaming"])
+def test_openvino_looks_at_mirrored_pairs_too(model: predictor.Predictor, mode: str) -> None:
+    config = dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, mirrored=True))
+    ours, theirs = (
+        predictor.predict(predictor.from_model(trained(), config, source="memory", backend=which), FRAMES, mode=mode)
+        for which in ("jax", "openvino")
+    )
+    assert np.abs((theirs.steps - ours.steps) / ours.sigma).max() < 5 * TOLERANCE["float32"]
+    single = predictor.predict(model, FRAMES, mode=mode)
+    assert np.abs((single.steps - ours.steps) / ours.sigma).max() > 0.01
+
+
+@openvino
 @pytest.mark.parametrize("precision", ["float32", "bfloat16"])
 def test_maps_of_many_pixels(model: predictor.Predictor, precision: str) -> None:
     image = dataclasses.replace(CONFIG.image, height=70, width=150)

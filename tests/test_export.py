@@ -1,5 +1,6 @@
 """The exported step runs without this package and says what ours says."""
 
+import dataclasses
 import importlib.util
 import json
 import subprocess
@@ -20,8 +21,10 @@ SCALE = np.linspace(0.5, 2, 6)
 
 @pytest.fixture(scope="module")
 def model() -> predictor.Predictor:
+    """One that looks at mirrored pairs, too, as the weights that ship."""
+    config = dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, mirrored=True))
     return predictor.from_model(
-        trained(), CONFIG, source="memory", sigma_scale=SCALE, scale_sigma=0.06, correlation=SCALE / 10
+        trained(), config, source="memory", sigma_scale=SCALE, scale_sigma=0.06, correlation=SCALE / 10
     )
 
 
@@ -96,8 +99,9 @@ def test_about_says_what_a_reader_has_to_know(folder: Path) -> None:
     assert about["image"]["normalisation"].startswith("standard")
     assert about["components"] == ["tx", "ty", "tz", "rx", "ry", "rz"]
     assert about["result"]["covariance"] == {"shape": ["B", 6, 6], "type": "float32"}
-    assert about["result"]["mixture_mean"]["shape"] == ["B", 2, 6]
-    assert about["state"]["gates"]["shape"] == [4, 64]
+    assert about["result"]["mixture_mean"]["shape"] == ["B", 4, 6]
+    assert about["state"]["gates"]["shape"] == [4, 128]
+    assert about["mirrored"] is True
     assert about["sigma_scale"] == SCALE.tolist()
     assert about["scale_sigma"] == 0.06
     assert about["step_correlation"] == pytest.approx(SCALE / 10)

@@ -50,7 +50,7 @@ def weights(mixture: Mixture) -> np.ndarray:
 affine, cdf, crps, interval, mean, quantile, strongest, variance = map(
     jax.jit, (mx.affine, mx.cdf, mx.crps, mx.interval, mx.mean, mx.quantile, mx.strongest, mx.variance)
 )
-add_noise, widen = jax.jit(mx.add_noise), jax.jit(mx.widen)
+add_noise, pool, widen = jax.jit(mx.add_noise), jax.jit(mx.pool), jax.jit(mx.widen)
 covariance, log_prob, mode = (
     jax.jit(function, static_argnames="coupling") for function in (mx.covariance, mx.log_prob, mx.mode)
 )
@@ -634,6 +634,38 @@ def test_widening_is_by_dimension_and_keeps_the_shape(x64: None) -> None:
     np.testing.assert_allclose(cdf(found, moved_value), cdf(original, value), rtol=1e-10)
 
 
+def test_a_pool_has_the_mean_of_the_densities(x64: None) -> None:
+    """By hand, then whatever the numbers of components: 0 and 2 with sigma 1 have mean 1 and variance 1 + 1 = 2."""
+    one = Mixture(np.array([7.0]), np.array([[0.0]]), np.array([[0.0]]))
+    both = pool([one, one._replace(logits=np.array([-3.0]), mean=np.array([[2.0]]))])
+    np.testing.assert_allclose(mean(both), [1.0], rtol=1e-12)
+    np.testing.assert_allclose(variance(both), [2.0], rtol=1e-12)
+
+    parts, value = [random_mixture(seed, components=seed + 1) for seed in range(3)], random_value()
+    found = pool(parts)
+    assert found.logits.shape == (*BATCH, 1 + 2 + 3)
+    densities = np.exp([log_prob(device(part), value, coupling="joint") for part in parts])
+    np.testing.assert_allclose(np.exp(log_prob(found, value, coupling="joint")), densities.mean(0), rtol=1e-12)
+    for function in (mean, lambda part: cdf(part, value)):
+        np.testing.assert_allclose(function(found), np.mean([function(part) for part in parts], axis=0), rtol=1e-12)
+    spread = np.var([mean(part) for part in parts], axis=0)
+    np.testing.assert_allclose(variance(found), np.mean([variance(part) for part in parts], 0) + spread, rtol=1e-12)
+    np.testing.assert_allclose(log_prob(pool(parts[2:]), value), log_prob(parts[2], value), rtol=1e-12)
+
+
+def test_a_pool_of_extremes_is_finite_and_so_are_its_gradients() -> None:
+    def total(logits: jax.Array) -> jax.Array:
+        parts = [Mixture(row, jnp.array([[0.0], [1e4]]), jnp.array([[-9.0], [9.0]])) for row in logits]
+        return mx.log_prob(mx.pool(parts), jnp.array([3.0]))
+
+    logits = jnp.array([[0.0, -jnp.inf], [1e4, -1e4], [-1e30, 1e30]])
+    value, gradient = jax.value_and_grad(total)(logits)
+    assert np.isfinite(value) and np.isfinite(gradient).all()
+    # The last part is all in its second component, which alone reaches 3; it is a third of the whole.
+    expected = stats.norm.logpdf(3, 1e4, np.exp(9)) - np.log(3)
+    np.testing.assert_allclose(value, expected, rtol=1e-5)
+
+
 @PROPERTY
 @hypothesis.given(MIXTURES, arrays(2))
 def test_mode_is_the_highest_point(mixture: Mixture, value: np.ndarray) -> None:
@@ -803,6 +835,11 @@ MISTAKES: dict[str, tuple[Callable[[], object], str]] = {
     "noise shape": (lambda: mx.add_noise(GOOD, 0.1), r"sigma has shape \(\); expected \(3,\)"),
     "noise sign": (lambda: mx.add_noise(GOOD, jnp.array([1.0, -1, 0])), "sigma is .*expected numbers of 0 or more"),
     "noise of no number": (lambda: mx.add_noise(GOOD, jnp.array([1.0, jnp.nan, 0])), "expected numbers of 0 or more"),
+    "pool of nothing": (lambda: mx.pool([]), r"\[\]; expected one or more"),
+    "pool of two batches": (
+        lambda: mx.pool([GOOD, Mixture(*(field[0] for field in GOOD))]),
+        r"\[\(\(2, 3\), 3\), \(\(3,\), 3\)\]; expected one or more, all of one",
+    ),
     "outputs of another size": (
         lambda: mx.from_network(jnp.ones(12), 1, floor=1.0),
         r"\(12,\); expected \[\.\.\., 13\]",

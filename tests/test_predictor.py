@@ -13,7 +13,7 @@ import pytest
 import small_model
 from small_model import CONFIG, LABELS
 
-from mdnvo_jax import mixture, predictor
+from mdnvo_jax import geometry, mixture, predictor
 from mdnvo_jax.errors import InputError
 from mdnvo_jax.mixture import Mixture
 from mdnvo_jax.model.head import mixture_from_outputs
@@ -62,6 +62,22 @@ def test_offline_every_step_is_that_of_its_window(model: predictor.Predictor) ->
     np.testing.assert_allclose(path.mixture.mean[3], direct(model, 2, 6).mean[1], atol=1e-5)
     np.testing.assert_allclose(path.mixture.log_scale[0], direct(model, 0, 4).log_scale[0], atol=1e-5)
     np.testing.assert_allclose(path.mixture.logits[10], direct(model, 7, 11).logits[3], atol=1e-5)
+
+
+@pytest.mark.parametrize("mode", ["offline", "streaming"])
+def test_mirrored_frames_show_the_mirrored_way_where_both_are_looked_at(model: predictor.Predictor, mode: str) -> None:
+    """Not so by itself: the network's two answers differ, and sigma grows by what they differ."""
+    config = dataclasses.replace(CONFIG, model=dataclasses.replace(CONFIG.model, mirrored=True))
+    both = predictor.from_model(predictor.trained(model.source)[0], config, source="memory")
+    straight, turned = (predictor.predict(both, frames, mode=mode) for frames in (FRAMES, FRAMES[:, :, ::-1]))
+    np.testing.assert_allclose(turned.steps, geometry.mirror_step(straight.steps), atol=1e-5)
+    np.testing.assert_allclose(turned.sigma, straight.sigma, rtol=1e-4)
+    one, other = (predictor.predict(model, frames, mode=mode) for frames in (FRAMES, FRAMES[:, :, ::-1]))
+    apart = one.steps - geometry.mirror_step(other.steps)
+    assert np.abs(apart / LABELS.std).max() > 0.05, "a network that sees no difference tests nothing"
+    np.testing.assert_allclose(straight.steps, one.steps - apart / 2, atol=1e-5)
+    expected = (one.sigma**2 + other.sigma**2) / 2 + apart**2 / 4
+    np.testing.assert_allclose(straight.sigma**2, expected, rtol=1e-4)
 
 
 def test_every_pair_goes_through_the_convolutions_once(model: predictor.Predictor) -> None:

@@ -33,7 +33,6 @@ def mixture_from_outputs(
     labels: Labels,
     model_config: ModelConfig,
     residual_scale: Array | None = None,
-    sigma_scale: Array | None = None,
 ) -> Mixture:
     """Return the density of the step, in metres and radians: the one place where standardisation is undone.
 
@@ -44,8 +43,6 @@ def mixture_from_outputs(
         metres and radians.
       residual_scale: for the head "regression" only, which predicts no scale: the standard deviation `[6]` of its
         residuals, in standardised units. Its density is a single Gaussian.
-      sigma_scale: factors `[6]` that every sigma is multiplied by, fitted on validation data (see `recalibration`);
-        a sigma may then fall below the floor.
 
     Raises:
       ValueError: a head "regression" without `residual_scale`.
@@ -54,21 +51,16 @@ def mixture_from_outputs(
     floor = scale_floor(model_config, outputs.dtype)
     if model_config.head == "mixture":
         standardised = mixture.from_network(outputs, model_config.components, dimensions=STEP_SIZE, floor=floor / std)
-        return _recalibrated(mixture.affine(standardised, std, mean), sigma_scale)
+        return mixture.affine(standardised, std, mean)
     if residual_scale is None:
         raise ValueError("head 'regression' predicts no scale: give residual_scale, its residuals' standard deviation")
     scale = jnp.maximum(jnp.asarray(residual_scale, outputs.dtype) * std, floor)
     steps = outputs * std + mean
-    gaussian = Mixture(
+    return Mixture(
         logits=jnp.zeros((*outputs.shape[:-1], 1), outputs.dtype),
         mean=steps[..., None, :],
         log_scale=jnp.broadcast_to(jnp.log(scale), steps.shape)[..., None, :],
     )
-    return _recalibrated(gaussian, sigma_scale)
-
-
-def _recalibrated(density: Mixture, sigma_scale: Array | None) -> Mixture:
-    return density if sigma_scale is None else mixture.widen(density, sigma_scale)
 
 
 def scale_floor(model_config: ModelConfig, dtype: jnp.dtype) -> Array:

@@ -19,11 +19,12 @@ from mdnvo_jax.model.network import Network
 from mdnvo_jax.training import checkpoint
 from mdnvo_jax.training.state import initial_variables
 
-# Fields of the model that weights do not depend on: how it is trained, and how products are computed.
+# Fields of the model that weights do not depend on: how it is trained, how products are computed, how it predicts.
 _FREE = (
     "conv_dropout",
     "batch_norm_momentum",
     "lstm_dropout",
+    "mirrored",
     "flow_weight",
     "products",
     "activations",

@@ -6,7 +6,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from mdnvo_jax import mixture
 from mdnvo_jax.config import ImageConfig, ModelConfig
+from mdnvo_jax.data import augment
+from mdnvo_jax.geometry import mirror_step
 from mdnvo_jax.model import fold
 from mdnvo_jax.model.conv import BATCH_NORM_EPSILON, LAYERS, ConvStack
 from mdnvo_jax.model.head import Labels, mixture_from_outputs
@@ -96,27 +99,57 @@ def test_products_in_bfloat16_are_the_convolutions_own():
         assert (program.count("bf16") > 0, program.count("platform_index")) == (expected > 0, expected)
 
 
-@pytest.mark.parametrize("bidirectional", [True, False])
-def test_the_parts_make_the_network(bidirectional):
-    model_config = dataclasses.replace(MODEL, bidirectional=bidirectional)
+@pytest.mark.parametrize(("bidirectional", "mirrored"), [(True, False), (False, False), (True, True)])
+def test_the_parts_make_the_network(bidirectional, mirrored):
+    model_config = dataclasses.replace(MODEL, bidirectional=bidirectional, mirrored=mirrored)
     network = build(IMAGE, model_config)
     variables = lively(template(network, IMAGE, 4))
     images = np.random.default_rng(0).integers(0, 256, (2, 5, 33, 65, 1), dtype=np.uint8)
     mask = np.array([[True] * 4, [True, False, True, False]])
-    outputs = jit(network.apply)(variables, images, mask)
+
+    def density(images):
+        return mixture_from_outputs(jit(network.apply)(variables, images, mask), LABELS, model_config)
+
+    expected = density(images)
+    if mirrored:
+        other = density(images[:, :, :, ::-1])
+        assert np.abs(mirror_step(other.mean) - expected.mean).max() > 0.1, "a network that sees no difference"
+        expected = mixture.pool([expected, other._replace(mean=mirror_step(other.mean))])
     scale = np.linspace(0.5, 2, 6)
-    expected = mixture_from_outputs(outputs, LABELS, model_config, sigma_scale=scale)
+    expected = mixture.widen(expected, scale)
 
     params, statistics = variables["params"], variables["batch_stats"]
     model = fold.Folded(
         fold.fold_stack(params["stack"], statistics["stack"]), params["lstm"], params["head"], LABELS, np.ones(6)
     )
-    features = [jit(fold.pair_features, static_argnums=2)(model, window, IMAGE) for window in images]
+    features = [jit(fold.pair_features, static_argnums=(2, 3))(model, window, IMAGE, model_config) for window in images]
     gates = jit(fold.pair_gates)(model, jnp.stack(features))
-    assert gates.shape == (2, 4, fold.gates_size(model)) == (2, 4, 32 * (1 + bidirectional))
+    size = 32 * (1 + bidirectional) * (1 + mirrored)
+    assert gates.shape == (2, 4, fold.gates_size(model, model_config)) == (2, 4, size)
     found = jit(fold.window_densities, static_argnums=3)(model, gates, mask, model_config, scale)
     for part, whole in zip(found, expected, strict=True):
         np.testing.assert_allclose(part[mask], whole[mask], rtol=1e-4, atol=1e-4)
+
+
+@pytest.mark.parametrize("centre", [None, 32.0, 30.5, 25.25])
+def test_a_mirrored_pair_is_what_the_mirrored_world_shows_the_same_camera(centre):
+    """As training's frames are mirrored, which are bytes: to a level of 255."""
+    camera = () if centre is None else (60.0, 60.0, centre, 16.0)
+    image = dataclasses.replace(IMAGE, normalisation="standard", camera=camera)
+    frames = np.random.default_rng(0).integers(0, 256, (3, 33, 65, 1), dtype=np.uint8)
+    pairs = fold.stacked_pairs(frames, image)
+    seen = fold.sides(pairs, image, dataclasses.replace(MODEL, mirrored=True))
+    np.testing.assert_array_equal(seen[::2], pairs)
+    expected = fold.stacked_pairs(np.stack([augment.mirror_frame(frame, camera or None) for frame in frames]), image)
+    assert np.abs(np.asarray(seen[1::2] - expected)).max() < (1.01 / 255 if centre == 25.25 else 1e-7)
+    assert fold.sides(pairs, image, MODEL) is pairs
+
+
+def test_of_frames_that_are_not_rectified_the_middle_mirrors():
+    image = dataclasses.replace(IMAGE, camera=(60.0, 60.0, 20.0, 16.0), rectify=False)
+    pairs = jnp.arange(65.0)[None, None, :, None] * jnp.ones((1, 33, 1, 2))
+    seen = fold.sides(pairs, image, dataclasses.replace(MODEL, mirrored=True))
+    np.testing.assert_array_equal(seen[1], pairs[0, :, ::-1])
 
 
 def test_frames_of_another_size_are_refused():

@@ -76,7 +76,7 @@ def test_shipped_weights_have_a_name(saved: Path, monkeypatch: pytest.MonkeyPatc
 
 
 def test_what_only_trains_may_differ(saved: Path) -> None:
-    free = {"model__conv_dropout": 0.3, "model__lstm_dropout": 0.0, "model__products": "mixed"}
+    free = {"model__conv_dropout": 0.3, "model__lstm_dropout": 0.0, "model__products": "mixed", "model__mirrored": True}
     with_flow = starting_from(saved, model__flow_weight=0.5, **free)
     initial.check(with_flow)
     variables, _ = start(with_flow)
