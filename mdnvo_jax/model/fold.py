@@ -102,7 +102,7 @@ def sides(pairs: Array, image_config: ImageConfig, model_config: ModelConfig) ->
     centre = known[2] if known else (width - 1) / 2
     source = np.clip(2 * centre - np.arange(width), 0, width - 1)
     weights = np.maximum(1 - np.abs(source[:, None] - np.arange(width)), 0).astype(np.float32)
-    # Exact: a mirror that turns with the columns, as that of a centred camera, copies them.
+    # For a camera that looks through the middle, or the middle between two columns, all weights are 0 or 1: a copy.
     mirrored = jnp.einsum("uw,nhwc->nhuc", weights, pairs, precision=jax.lax.Precision.HIGHEST)
     return jnp.stack([pairs, mirrored], axis=1).reshape(-1, *pairs.shape[1:])
 
