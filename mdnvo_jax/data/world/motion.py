@@ -37,11 +37,12 @@ def draw_mount(seed: int, height_m: tuple[float, float] = CAMERA_HEIGHT_M) -> Mo
     """Return the camera mount of a world: a height from the range `height_m`, KITTI's slightly lowered view, varied."""
     rng = stream(seed, "mount")
     return Mount(
-        ahead_m=rng.uniform(0.3, 1.6),
+        ahead_m=rng.uniform(0.3, 2.1),
         height_m=rng.uniform(*height_m),
         pitch_rad=np.deg2rad(np.clip(rng.normal(-0.6, 1.4), -4.2, 3.0)),
         yaw_rad=np.deg2rad(rng.normal(0, 0.6)),
-        roll_rad=np.deg2rad(rng.normal(0, 0.5)),
+        # On banked bends a car rolls as well. Where turns are seen level, a network reads pitch as zero in them.
+        roll_rad=np.deg2rad(np.clip(rng.normal(0, 1.5), -4.0, 4.0)),
     )
 
 
@@ -78,14 +79,19 @@ def camera_poses(style: Style, road: Road, frames: int, mount: Mount | None = No
     time = FRAME_S * np.arange(-margin, frames + margin)
     s = road_coordinate(road, time)
     speed = np.gradient(s, FRAME_S)
-    kernel = np.hanning(11)[1:-1]
-    braking = -np.convolve(np.gradient(speed, FRAME_S), kernel / kernel.sum(), mode="same")[margin:-margin]
+    bend = road.curvature[np.rint((s + BEHIND_M) / NODE_M).astype(int)]
+    kernel = np.hanning(11)[1:-1] / np.hanning(11).sum()
+    braking, cornering = (
+        np.convolve(acceleration, kernel, mode="same")[margin:-margin]
+        for acceleration in (-np.gradient(speed, FRAME_S), bend * speed**2)
+    )
     time, s, speed = time[margin:-margin], s[margin:-margin], speed[margin:-margin]
 
     d, drift = _wander(style, s)
     x, z, heading = place(road, s, d)
-    yaw = heading + np.arctan(drift)
-    bend = road.curvature[np.rint((s + BEHIND_M) / NODE_M).astype(int)]
+    # Rear tyres slip sideways by 0.05 to 0.4 degrees for a m/s^2: a cornering car looks into the bend.
+    slip = np.deg2rad(stream(style.seed, "tyres").uniform(0.05, 0.4)) * cornering
+    yaw = heading + np.arctan(drift) + slip
     rng = stream(style.seed, "springs")
     lively = np.minimum(np.abs(speed) / 8, 1.3) + 0.02
     softness = rng.uniform(0.5, 1.5)
@@ -94,7 +100,7 @@ def camera_poses(style: Style, road: Road, frames: int, mount: Mount | None = No
     heave = lively * rng.uniform(0.002, 0.015) * _sway(rng, time, _HEAVE_HZ)
     # A braking car noses down, a cornering one leans out: about 0.3 and 0.4 degrees for a m/s^2.
     bounce_pitch = bounce_pitch - softness * np.deg2rad(0.3) * braking
-    bounce_roll = bounce_roll - softness * np.deg2rad(0.4) * bend * speed**2
+    bounce_roll = bounce_roll - softness * np.deg2rad(0.4) * cornering
     bump_pitch, bump_heave = _bumps(style, s, speed)
     bounce_pitch, heave = bounce_pitch + bump_pitch, heave + bump_heave
     if style.reversing:
