@@ -21,7 +21,7 @@ from mdnvo_jax.evaluation.drift import Drift
 from mdnvo_jax.evaluation.formats import PoseFile
 from mdnvo_jax.evaluation.report import CalibrationPictures, PathPicture, Report, UncertaintyPicture
 from mdnvo_jax.evaluation.scoring import PathScore
-from mdnvo_jax.mixture import Mixture, add_noise
+from mdnvo_jax.mixture import add_noise
 from mdnvo_jax.odometry import COMPONENTS, Trajectory, trajectory
 
 if TYPE_CHECKING:
@@ -197,16 +197,15 @@ def _calibrations(
     name: str, split: str, predicted: Many[Predicted], step: MeanStep, block: int, reference_sigma: np.ndarray
 ) -> tuple[list[CalibrationRow], StepScores]:
     """Calibrate the model and the constant predictor; the scores are those of the model's whole mixture."""
-
-    def as_referred(density: Mixture) -> Mixture:
-        return add_noise(density, reference_sigma) if reference_sigma.any() else density
-
     truths = [true_steps(item.truth) for item in predicted]
     frames = sum(len(item.truth) for item in predicted)
     rows, scores = tabled.calibration_rows(
         name,
         split,
-        [(as_referred(item.trajectory.mixture), truth) for item, truth in zip(predicted, truths, strict=True)],
+        [
+            (add_noise(item.trajectory.mixture, reference_sigma), truth)
+            for item, truth in zip(predicted, truths, strict=True)
+        ],
         coupling=predicted[0].trajectory.coupling,
         frames=(frames, frames),
         block=block,
@@ -214,7 +213,10 @@ def _calibrations(
     floor, _ = tabled.calibration_rows(
         CONSTANT,
         split,
-        [(as_referred(constant.constant_mixture(step.mean, step.std, len(truth))), truth) for truth in truths],
+        [
+            (add_noise(constant.constant_mixture(step.mean, step.std, len(truth)), reference_sigma), truth)
+            for truth in truths
+        ],
         coupling="independent",
         frames=(frames, frames),
         block=block,

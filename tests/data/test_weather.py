@@ -307,7 +307,7 @@ def test_dry_asphalt_mirrors_the_sun_where_it_stands_ahead(day):
 
     def gain(towards, sheen):
         sun = towards * np.cos(0.5) / np.linalg.norm(towards) + np.array([0, -np.sin(0.5), 0])
-        style = day.style._replace(sun=sun, sun_strength=0.7, sky_strength=0.3, sheen=0.0)
+        style = day.style._replace(sun=sun, sun_strength=0.7, sky_strength=0.3)
         before, after = (picture(day, style=style._replace(sheen=value)).astype(float) for value in (0.0, sheen))
         return (after + 1) / (before + 1)
 
