@@ -33,8 +33,9 @@ config = Config(
         batch_norm_momentum=0.99,
         lstm_hidden=128,
         lstm_layers=1,
-        lstm_dropout=0.1,
+        lstm_dropout=0.0,
         components=3,
+        mirrored=True,
         flow_weight=0.5,
     ),
     data=DataConfig(
