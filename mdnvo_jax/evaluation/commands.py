@@ -73,6 +73,10 @@ def _add_recalibrate(subcommands: "argparse._SubParsersAction[Parser]") -> None:
     add("--root", metavar="DIR", help="the folder of the training's data set [where the training found it]")
     add("--cache", metavar="DIR", help="its cache of prepared frames [with --root: none; else that of the training]")
     add("--mode", choices=("offline", "streaming"), default="offline", help="predict as this does [%(default)s]")
+    widen_help = (
+        "factors of 1 or more alone: for weights that will see other roads than the split's, which err more there"
+    )
+    add("--widen-only", action="store_true", help=widen_help)
     add("--force", action="store_true", help="overwrite factors that are there")
 
 

@@ -64,7 +64,7 @@ def run(options: argparse.Namespace) -> tuple[Table, Path]:
         "sequences": names,
         "mode": options.mode,
     }
-    found, table = fit(predictions, model.config.model.coupling, about)
+    found, table = fit(predictions, model.config.model.coupling, about, widen_only=options.widen_only)
     written = recalibration.write(
         model.source, found, checkpoint=Path(model.source).name, command=shlex.join(sys.orig_argv)
     )
@@ -89,7 +89,11 @@ def validation_sequences(config: "Config", *, root: str | None, cache: str | Non
 
 
 def fit(
-    predictions: Many[tuple[Mixture, np.ndarray]], coupling: Coupling, fitted_on: dict[str, Any]
+    predictions: Many[tuple[Mixture, np.ndarray]],
+    coupling: Coupling,
+    fitted_on: dict[str, Any],
+    *,
+    widen_only: bool = False,
 ) -> tuple[SigmaScale, Table]:
     """Fit factors and errors that steps share on several sequences, and tabulate what the factors do to them.
 
@@ -100,7 +104,9 @@ def fit(
     Args:
       predictions: of each sequence, densities `[n, M, 6]` and true steps `[n, 6]`.
       coupling: of the densities.
-      fitted_on: what the predictions are of, to be kept, beside the error of scale of each.
+      fitted_on: what the predictions are of, to be kept, beside the error of scale of each and the factors as fitted.
+      widen_only: leave sigmas as they are that these predictions show to be too wide. Elsewhere than on drives like
+        those of the training errors are larger, and what is rather too wide at home is about right there.
 
     Raises:
       InputError: there is no step.
@@ -110,7 +116,8 @@ def fit(
     leaves: list[Any] = [np.concatenate(parts) for parts in zip(*(density for density, _ in predictions), strict=True)]
     density = Mixture(*leaves)
     truth = np.concatenate([steps for _, steps in predictions])
-    scale = fit_sigma_scale(density, truth)
+    fitted = fit_sigma_scale(density, truth)
+    scale = np.maximum(fitted, 1) if widen_only else fitted
     before = score(density, truth, coupling=coupling)
     after = score(widen(density, scale), truth, coupling=coupling)
     together = _errors_together(predictions, coupling, scale)
@@ -119,7 +126,7 @@ def fit(
         steps=len(truth),
         nll_before=float(before.nll.mean()),
         nll_after=float(after.nll.mean()),
-        fitted_on=fitted_on | {"scale_errors": together.scale.tolist()},
+        fitted_on=fitted_on | {"scale_errors": together.scale.tolist(), "fitted_scale": fitted.tolist()},
         scale_sigma=fit_scale_sigma(together.scale, together.variance),
         correlation=fit_correlation(together.rest, together.steps),
         drives=len(predictions),
@@ -181,6 +188,13 @@ def _table(found: SigmaScale, before: StepScores, after: StepScores) -> Table:
         for k, name in enumerate(COMPONENTS)
     ]
     notes = [f"NLL of these steps: {found.nll_before:.3f} before, {found.nll_after:.3f} after (nats a step, m and rad)"]
+    narrower = [
+        f"{name} {factor:.3f}"
+        for name, factor, applied in zip(COMPONENTS, found.fitted_on["fitted_scale"], found.scale, strict=True)
+        if factor < applied
+    ]
+    if narrower:
+        notes.append(f"too wide for these steps, and left so: {', '.join(narrower)} would be their factors")
     if found.steps < _FEW_STEPS:
         notes.append(f"{found.steps} steps are few: a factor is known to some {100 / np.sqrt(2 * found.steps):.0f} %")
     notes.append(

@@ -104,6 +104,22 @@ def drives_too_sure_by_three(errors, steps):
         yield Mixture(np.zeros((steps, 1)), mean[:, None], np.tile(np.log(sigma), (steps, 1, 1))), truth
 
 
+def test_sigmas_that_are_too_wide_may_be_left_so():
+    """Half of the components too sure by two, half too wide by two: the former are mended, the latter said."""
+    rng = np.random.default_rng(0)
+    truth = rng.normal(size=(4000, 6)) * np.array([2, 2, 2, 0.5, 0.5, 0.5])
+    density = Mixture(np.zeros((4000, 1)), np.zeros((4000, 1, 6)), np.zeros((4000, 1, 6)))
+    found, table = recalibrate.fit([(density, truth)], "joint", {"sequences": ["a"]}, widen_only=True)
+    np.testing.assert_allclose(found.scale[:3], 2, rtol=0.04)
+    np.testing.assert_array_equal(found.scale[3:], 1)
+    np.testing.assert_allclose(found.fitted_on["fitted_scale"], [2, 2, 2, 0.5, 0.5, 0.5], rtol=0.04)
+    (note,) = [line for line in table.notes if "left so" in line]
+    assert "rx 0.5" in note and "rz 0.5" in note and "tx" not in note
+    plain, table = recalibrate.fit([(density, truth)], "joint", {"sequences": ["a"]})
+    np.testing.assert_array_equal(plain.scale, plain.fitted_on["fitted_scale"])
+    assert not any("left so" in line for line in table.notes)
+
+
 def test_errors_of_steps_do_not_pass_for_errors_of_scale():
     names = {"sequences": [f"{i:02d}" for i in range(60)]}
     found, _ = recalibrate.fit(list(drives_too_sure_by_three(np.zeros(60), 25)), "joint", names)
