@@ -4,8 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mdnvo_jax.data.world.motion import ego_lane_m, road_coordinate
-from mdnvo_jax.data.world.road import BEHIND_M, NODE_M, Road
+from mdnvo_jax.data.world.motion import road_coordinate
+from mdnvo_jax.data.world.road import BEHIND_M, NODE_M, Road, ego_lane_m
 from mdnvo_jax.data.world.style import Style, stream
 from mdnvo_jax.data.world.things import BALL, BOX, Paint, Things, join, make, paint, select, tint
 

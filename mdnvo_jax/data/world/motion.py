@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mdnvo_jax.data.world.road import BEHIND_M, NODE_M, Road, ground, place
+from mdnvo_jax.data.world.road import BEHIND_M, NODE_M, Road, ego_lane_m, ground, place
 from mdnvo_jax.data.world.style import Style, stream
 
 # KITTI's frame rate.
@@ -128,12 +128,6 @@ def turn(angle: np.ndarray | float, axis: int) -> np.ndarray:
     result[..., second, first] = np.sin(angle)
     result[..., first, second] = -np.sin(angle)
     return result
-
-
-def ego_lane_m(style: Style) -> float:
-    """Return d of the middle of the lane that the car drives in, m."""
-    lane = int(stream(style.seed, "lane").integers(style.lanes))
-    return style.side * style.lane_m * (lane + 0.5)
 
 
 def _wander(style: Style, s: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -18,11 +18,9 @@ BEHIND_M = 320.0
 AHEAD_M = 720.0
 # Road is laid for this speed, m/s; nothing drives faster.
 TOP_SPEED_MPS = 30.0
-# What passengers and tyres bear: lateral acceleration, m/s^2, and yaw rate, rad/s; and the tightest bend, 1/m.
-LATERAL_MPS2 = 4.0
-YAW_RATE_RADPS = 0.7
-_TIGHTEST_PER_M = 1 / 7.5
-# Share of those limits that the road uses: smoothing the curvature and wandering in the lane take the rest.
+# Radius of the tightest circle that the middle of the car's rear axle goes around, m.
+TURNING_RADIUS_M = 4.5
+# Share of the driver's limits that the road uses: smoothing the curvature and wandering in the lane take the rest.
 _MARGIN = 0.95
 
 
@@ -77,6 +75,12 @@ def place(road: Road, s: np.ndarray, d: np.ndarray) -> tuple[np.ndarray, np.ndar
     x = road.x[node] + chord * np.sin(middle) + d * np.cos(heading)
     z = road.z[node] + chord * np.cos(middle) - d * np.sin(heading)
     return x, z, heading
+
+
+def ego_lane_m(style: Style) -> float:
+    """Return d of the middle of the lane that the car drives in, m."""
+    lane = int(stream(style.seed, "lane").integers(style.lanes))
+    return style.side * style.lane_m * (lane + 0.5)
 
 
 def ground(road: Road, x: np.ndarray, z: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -151,13 +155,13 @@ def _events(style: Style, s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.nda
     pause = np.zeros(len(s))
     pause[node[corners.stop]] = corners.pause[corners.stop]
 
-    limit = _curvature_limit(speed)
+    limit = _curvature_limit(style, speed)
     bend = corners.share * limit[node]
     extent = np.clip(corners.turn / np.maximum(np.abs(bend), 1e-6), 12.0, corners.longest)
     ramp = np.clip((0.5 - away / extent) / 0.3, 0, 1)
     curvature = (bend * ramp * ramp * (3 - 2 * ramp)).sum(1)
     curvature = np.clip(curvature, -limit, limit)
-    window = np.hanning(9)[1:-1]
+    window = np.hanning(5)[1:-1]
     return speed, pause, np.convolve(curvature, window / window.sum(), mode="same")
 
 
@@ -182,20 +186,21 @@ def _ordinary_corners(style: Style, s: np.ndarray) -> _Corners:
 
 
 def _winding_corners(style: Style, s: np.ndarray) -> _Corners:
-    """Return corner after corner, at every speed and as sharp as lateral acceleration and yaw rate then allow.
+    """Return corner after corner, at every speed and of every sharpness that lateral acceleration and yaw rate allow.
 
-    Quick corners are wide ones: were all of them slow, a network would learn that who turns is slow.
+    Were all of them slow, a network would learn that who turns is slow; were all as sharp as their speed allows, that
+    the speed follows from the turn.
     """
     pitch = 18.0 + 2.0 * style.cruise_mps
     place, stop, draw = _places(style, s, pitch)
-    share = np.where(stop, style.bends * draw[:, 3], 0.75 + 0.25 * draw[:, 3])
+    share = np.where(stop, style.bends * draw[:, 3], 0.5 + 0.5 * draw[:, 3])
     # Left and right by turns: so many sharp corners to one side would lead the road across itself.
     side = np.where((np.arange(len(place)) + style.seed) % 2, -1, 1)
     return _Corners(
         place=place,
         stop=stop,
         pause=1 + 5 * draw[:, 7],
-        target=np.minimum(style.cruise_mps, 3.5 + 10 * draw[:, 2]),
+        target=np.minimum(style.cruise_mps, 3.5 + 14 * draw[:, 2]),
         hold=np.full(len(place), 0.3 * pitch),
         share=side * share,
         # The ramps at both ends of a corner take as much of its angle again.
@@ -214,10 +219,11 @@ def _places(style: Style, s: np.ndarray, pitch: float) -> tuple[np.ndarray, np.n
     return place, (draw[:, 1] < style.stops) & (np.abs(place) > 15), draw
 
 
-def _curvature_limit(speed: np.ndarray) -> np.ndarray:
-    """Return the largest curvature, 1/m, that may be driven at `speed`."""
+def _curvature_limit(style: Style, speed: np.ndarray) -> np.ndarray:
+    """Return the largest curvature, 1/m, that may be driven at `speed`: such that a car in its lane gets around it."""
     fast = np.maximum(speed, 1e-3)
-    return np.minimum(_MARGIN * np.minimum(LATERAL_MPS2 / fast**2, YAW_RATE_RADPS / fast), _TIGHTEST_PER_M)
+    bearable = _MARGIN * np.minimum(style.lateral_mps2 / fast**2, style.yaw_rate_radps / fast)
+    return np.minimum(bearable, 1 / (TURNING_RADIUS_M + abs(ego_lane_m(style))))
 
 
 def _hills(style: Style) -> np.ndarray:

@@ -6,6 +6,11 @@ from typing import NamedTuple
 import numpy as np
 
 
+# The most that any driver takes: lateral acceleration, m/s^2, and yaw rate, rad/s.
+LATERAL_MPS2 = 10.0
+YAW_RATE_RADPS = 1.4
+
+
 class Style(NamedTuple):
     """The choices that hold for a whole world. Colours are linear reflectances (R, G, B).
 
@@ -14,6 +19,7 @@ class Style(NamedTuple):
       cruise_mps: speed on the open road; 0 stands still.
       reversing: whether the car drives backwards.
       acceleration_mps2: of speeding up and braking.
+      lateral_mps2, yaw_rate_radps: how quickly the driver takes the sharpest bends.
       stops, slows: chances that a place on the road makes the car stop, or slow down.
       bends: strength of ordinary bends, as a share of what the speed allows.
       winding: whether corner follows corner, as sharp as the car can take them: junctions, narrow streets, ramps.
@@ -44,6 +50,8 @@ class Style(NamedTuple):
     cruise_mps: float
     reversing: bool
     acceleration_mps2: float
+    lateral_mps2: float
+    yaw_rate_radps: float
     stops: float
     slows: float
     bends: float
@@ -110,7 +118,7 @@ def draw_style(seed: int) -> Style:
     # But for half of those that wind: ramps and narrow bends in the open. Else a network would learn that who turns
     # sharply is in a town, and that in the open the road is straight.
     turns = stream(seed, "winding")
-    winding = bool(3 < cruise < 15 and turns.random() < 0.5)
+    winding = bool(3 < cruise < 20 and turns.random() < 0.5)
     in_the_open = winding and bool(turns.random() < 0.5)
     town = 0.15 * turns.random() if in_the_open else town
     ramp = in_the_open and bool(turns.random() < 0.6)
@@ -135,13 +143,19 @@ def draw_style(seed: int) -> Style:
     cover = stream(seed, "cover")
     new = bool(cover.random() < 0.4) and marked
     plainness = cover.uniform(0.1, 0.5) if new else 1.0
+    # Far beyond what passengers bear. Where all that was seen ends at some lateral acceleration, or at some yaw rate,
+    # a network knows from how a car turns how fast it can be at most, and reads those that are faster as that.
+    driver = stream(seed, "driver")
+    lateral, yaw_rate = driver.uniform(3, LATERAL_MPS2), driver.uniform(0.6, YAW_RATE_RADPS)
     sky_strength = 1 - sun_strength - (0.1 if overcast else 0.0)
     haze = np.exp(rng.uniform(np.log(300), np.log(3000)))
     return Style(
         seed=seed,
         cruise_mps=cruise,
         reversing=bool(cruise < 6 and rng.random() < 0.25),
-        acceleration_mps2=rng.uniform(1.2, 2.8),
+        acceleration_mps2=rng.uniform(1.2, 4.0),
+        lateral_mps2=lateral,
+        yaw_rate_radps=yaw_rate,
         stops=0.15 * town * rng.random(),
         slows=0.8 * (1 - motorway) * rng.random(),
         bends=rng.random(),
