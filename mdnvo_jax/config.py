@@ -118,6 +118,8 @@ class DataConfig:
     mirror: float = 0.0
     # Strength of the photometric augmentation (gain, gamma, offset, noise); 0 turns it off.
     photometric: float = 0.0
+    # Chance that a window is exposed for the shade: what the sun lights goes white.
+    overexposed: float = 0.0
     # Chance that a window is shown as a camera with a narrower view would have it, the edge repeated outwards, as
     # bringing such a camera's frames to the virtual camera does.
     narrow: float = 0.0

@@ -285,6 +285,8 @@ def _training_window(
         flow = None if flow is None else augment.mirror_flow(flow, camera)
     if rng.random() < data.narrow:
         frames = list(augment.narrow(np.stack(frames), rng))
+    if data.overexposed > 0 and rng.random() < data.overexposed:
+        frames = list(augment.overexpose(np.stack(frames), rng))
     if data.photometric > 0:
         frames = list(augment.photometric(np.stack(frames), data.photometric, rng))
     return _Example(frames, labels, flow)

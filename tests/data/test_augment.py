@@ -13,6 +13,7 @@ from mdnvo_jax.data.augment import (
     mirror_frame,
     most_pan,
     narrow,
+    overexpose,
     photometric,
     sway_flow,
     sway_frames,
@@ -113,6 +114,20 @@ def test_colours_are_toned_by_their_own_gain():
     frames = np.full((1, 30, 30, 3), 128, np.uint8)
     means = np.stack([draw(frames, seed).mean((0, 1, 2)) for seed in range(30)])
     assert 1 < (means - means.mean(1, keepdims=True)).std() < 15
+
+
+def test_overexposed_frames_are_brighter_by_one_gain_until_they_are_white():
+    frames = np.tile(np.arange(256, dtype=np.uint8), (3, 4, 1))[..., None]
+    gains = []
+    for seed in range(200):
+        window = overexpose(frames, np.random.default_rng(seed))
+        assert window.dtype == np.uint8 and window.shape == frames.shape
+        np.testing.assert_array_equal(window, window[:1, :1].repeat(3, 0).repeat(4, 1))
+        curve = window[0, 0, :, 0].astype(float)
+        gain = curve[40] / 40
+        np.testing.assert_allclose(curve, np.minimum(gain * np.arange(256), 255), atol=256 * 0.5 / 40 + 0.5)
+        gains.append(gain)
+    assert 0.98 < min(gains) < 1.03 and 2.4 < max(gains) < 2.53 and 1.4 < np.median(gains) < 1.75
 
 
 # Optical flow and narrower views

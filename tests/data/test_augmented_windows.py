@@ -118,6 +118,19 @@ def test_mirrored_windows_have_mirrored_flow_and_narrow_ones_keep_it(toy):
         np.testing.assert_array_equal(batch["flow"][row], augment.mirror_flow(flow[frames[:-1]], camera))
 
 
+def test_as_many_windows_as_asked_for_are_overexposed_and_keep_their_labels(toy):
+    pixels = np.random.default_rng(0).integers(0, 256, (40, 8, 16, 1), dtype=np.uint8)
+    sequence = dataclasses.replace(toy(40), read=lambda i: pixels[i])
+    config = config_of(image=IMAGE, batch_size=30, window=4, overexposed=0.5)
+    plain = dataclasses.replace(config, data=dataclasses.replace(config.data, overexposed=0.0))
+    batch, before = (taken(windows.training_batches([sequence], c, seed=0), 1)[0] for c in (config, plain))
+    np.testing.assert_array_equal(batch["steps"], before["steps"])
+    assert (batch["images"] >= before["images"]).all()
+    brighter = (batch["images"] > before["images"]).any(axis=(1, 2, 3, 4))
+    assert 8 <= brighter.sum() <= 22
+    assert ((batch["images"] == 255).mean(axis=(1, 2, 3, 4)) > 0.02)[brighter].sum() > 5
+
+
 def test_swaying_windows_have_swaying_frames_labels_and_flow(toy):
     camera = (9.0, 9.0, 7.5, 3.5)
     pixels = np.random.default_rng(0).integers(0, 256, (40, 8, 16, 1), dtype=np.uint8)
