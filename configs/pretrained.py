@@ -6,14 +6,14 @@
 
 Frames of any camera with known intrinsics are brought to one virtual camera: 82 degrees across, as KITTI's, without the
 upper third of the sky. What each choice is worth at a small budget is in BENCHMARKS.md (`bin/ablate` on
-`configs/ablation.py`). The weights that ship had seven sittings, each from the one before, which `bin/ship_weights`
-had put into a copy of the repository: this file from scratch on 2,000 worlds, and six times
+`configs/ablation.py`). The weights that ship had eight sittings, each from the one before, which `bin/ship_weights`
+had put into a copy of the repository: this file from scratch on 2,000 worlds, and seven times
 
     python -m mdnvo_jax.train configs/pretrained.py --workdir runs/next --data.cache CACHE \\
         --training.initial_weights shipped --training.learning_rate 5e-4 --training.epochs 22
 
-(or 15, 18, 20, 24, or 25 epochs) on worlds that came ever closer to real roads, with a camera that swayed from the
-third on and panned as well from the fourth, and without dropout from the sixth. BENCHMARKS.md says which were which.
+(or 8 to 25 epochs) on worlds that came ever closer to real roads, with a camera that swayed from the third on and panned
+as well from the fourth, without dropout from the sixth, overexposed in the eighth. BENCHMARKS.md says which were which.
 """
 
 from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig, TrainingConfig
