@@ -6,14 +6,15 @@
 
 Frames of any camera with known intrinsics are brought to one virtual camera: 82 degrees across, as KITTI's, without the
 upper third of the sky. What each choice is worth at a small budget is in BENCHMARKS.md (`bin/ablate` on
-`configs/ablation.py`). The weights that ship had eight sittings, each from the one before, which `bin/ship_weights`
-had put into a copy of the repository: this file from scratch on 2,000 worlds, and seven times
+`configs/ablation.py`). The weights that ship had nine sittings, each from the one before, which `bin/ship_weights` had
+put into a copy of the repository: this file from scratch on 2,000 worlds, and eight times
 
     python -m mdnvo_jax.train configs/pretrained.py --workdir runs/next --data.cache CACHE \\
         --training.initial_weights shipped --training.learning_rate 5e-4 --training.epochs 22
 
-(or 8 to 25 epochs) on worlds that came ever closer to real roads, with a camera that swayed from the third on and panned
-as well from the fourth, without dropout from the sixth, overexposed in the eighth. BENCHMARKS.md says which were which.
+(or 5 to 25 epochs) on worlds that came ever closer to real roads, with a camera that swayed from the third on, panned
+as well from the fourth, and looked aside in the ninth, without dropout from the sixth, overexposed from the eighth.
+BENCHMARKS.md says which were which.
 """
 
 from mdnvo_jax.config import Config, DataConfig, ImageConfig, ModelConfig, TrainingConfig

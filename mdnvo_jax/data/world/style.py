@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-
 # The most that any driver takes: lateral acceleration, m/s^2, and yaw rate, rad/s.
 LATERAL_MPS2 = 10.0
 YAW_RATE_RADPS = 1.4
