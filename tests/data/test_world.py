@@ -71,8 +71,8 @@ def test_road_coordinates_undo_place(paths):
         eye = whole.poses[40, :3, 3]
         found_s, found_d, _ = undo(np.float32(x - eye[0]), np.float32(z - eye[2]), frame.lane)
         near = np.hypot(x - eye[0], z - eye[2]) < 90
-        # On the inside of the tightest corners, a node's length along the middle is a third of that 5 m beside it, and
-        # from a third of the way to their centre on, the road before and behind the corner is as near.
+        # On the inside of a corner, a node's length is the shorter the farther it is from the middle, and from a third
+        # of the way to its centre on, the road before and behind the corner is as near.
         tolerance = 0.3 if whole.style.winding else 0.02
         ahead = np.rint((s + BEHIND_M) / NODE_M).astype(int) + np.arange(-6, 7)[:, None]
         near &= np.abs(whole.road.curvature[ahead]).max(0) * np.abs(d) < 0.35

@@ -5,10 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-# The most that any driver takes: lateral acceleration, m/s^2, and yaw rate, rad/s.
-LATERAL_MPS2 = 10.0
-YAW_RATE_RADPS = 1.4
-
 
 class Style(NamedTuple):
     """The choices that hold for a whole world. Colours are linear reflectances (R, G, B).
@@ -145,7 +141,7 @@ def draw_style(seed: int) -> Style:
     # Far beyond what passengers bear. Where all that was seen ends at some lateral acceleration, or at some yaw rate,
     # a network knows from how a car turns how fast it can be at most, and reads those that are faster as that.
     driver = stream(seed, "driver")
-    lateral, yaw_rate = driver.uniform(3, LATERAL_MPS2), driver.uniform(0.6, YAW_RATE_RADPS)
+    lateral, yaw_rate = driver.uniform(3, 10), driver.uniform(0.6, 1.4)
     sky_strength = 1 - sun_strength - (0.1 if overcast else 0.0)
     haze = np.exp(rng.uniform(np.log(300), np.log(3000)))
     return Style(
