@@ -2,6 +2,7 @@
 
 import os
 import tempfile
+from collections.abc import Iterator
 from pathlib import Path
 
 import hypothesis
@@ -28,3 +29,12 @@ def data_root() -> Path:
     if not root.is_dir():
         pytest.skip(f"no real data at {root}: set MDNVO_DATA to the folder that holds kitti/ and trajectories/")
     return root
+
+
+@pytest.fixture
+def x64() -> Iterator[None]:
+    """JAX in float64."""
+    import jax  # reads the environment above when it is imported
+
+    with jax.enable_x64(True):
+        yield
