@@ -6,6 +6,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from nuscenes_fixture import write_nuscenes
+from nuscenes_reading import ONE
 from scipy.spatial.transform import Rotation
 
 from mdnvo_jax.data.sequence import Sequence
@@ -113,3 +115,19 @@ def raw_root(tmp_path):
         f"P_rect_02: 70 0 60 {70 * 0.06 + 60 * 0.003} 0 70 18 {18 * 0.003} 0 0 1 0.003\n"
     )
     return tmp_path
+
+
+# nuScenes, as nuscenes_fixture writes it.
+
+
+@pytest.fixture(scope="module")
+def mini(tmp_path_factory):
+    """The whole fixture, to read only: (root, truth by scene)."""
+    root = tmp_path_factory.mktemp("nuscenes")
+    return root, write_nuscenes(root)
+
+
+@pytest.fixture
+def one(tmp_path):
+    """A data set of one scene, to spoil: (root, truth)."""
+    return tmp_path, write_nuscenes(tmp_path, ONE)["scene-0061"]
