@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 SHARES = {"kills": 0.4, "corruption": 0.15, "fuzz": 0.15, "stream": 0.15, "scale": 0.15}
 # A part may finish what it has begun.
 _GRACE_S = 900
-_TESTS = Path(__file__).parents[2] / "tests" / "data" / "test_hostile.py"
+_TESTS = Path(__file__).parents[2] / "tests" / "data" / "hostile"
 # Examples of each of its properties.
 _EXAMPLES = 300
 
