@@ -30,12 +30,13 @@ _MOST_LOG_OVEREXPOSURE = float(np.log(2.5))
 # Largest shares of a frame that a narrower view lacks at its top, bottom, left and right.
 _NARROW = (0.3, 0.12, 0.25, 0.25)
 # Attitude of a swaying camera about x, y and z (pitch, yaw, roll), as standard deviations: what stays the same over a
-# window, what grows with every frame, and the strength of what swings, each in degrees. Mounts look aside by degrees;
-# a network that never saw it takes every car to go where its camera looks. The swing is of the size of the rendered
-# cars' own and of any frequency up to half the frame rate: no spring's alone. What grows are yaws as fast as cars turn
-# in corners, at any speed, for else a network learns that who turns drives slowly and reads his speed so; and pitch and
-# roll slower than springs', as on banked and rolling roads, which it would else read short.
-_SWAY_OFFSET_DEG = (0.6, 2.5, 0.4)
+# window, what grows with every frame, and the strength of what swings, each in degrees. Mounts look up, down and aside
+# by degrees. A network that never saw it takes every car to go where its camera looks, and reads a car whose camera
+# looks down too fast, one whose camera looks up too slow. The swing is of the size of the rendered cars' own and of any
+# frequency up to half the frame rate: no spring's alone. What grows are yaws as fast as cars turn in corners, at any
+# speed, for else a network learns that who turns drives slowly and reads his speed so; and pitch and roll slower than
+# springs', as on banked and rolling roads, which it would else read short.
+_SWAY_OFFSET_DEG = (1.5, 2.5, 1.0)
 _SWAY_RATE_DEG = (0.1, 0.8, 0.15)
 _SWAY_SWING_DEG = (0.2, 0.15, 0.2)
 _SWAY_SINES = 5
