@@ -12,10 +12,10 @@ import pytest
 hypothesis.settings.register_profile("mdnvo", deadline=None)
 hypothesis.settings.load_profile("mdnvo")
 
-# Programs that several tests and the processes they start compile alike are compiled once.
+# Programs that several tests and the processes they start compile alike are compiled once, and the small ones are many.
 _CACHE = tempfile.TemporaryDirectory(prefix="mdnvo-test-cache-")
 os.environ.setdefault("JAX_COMPILATION_CACHE_DIR", _CACHE.name)
-os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
 os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 # Tests compute little and compile much: without optimisation they take half as long.
 os.environ["XLA_FLAGS"] = f"{os.environ.get('XLA_FLAGS', '')} --xla_backend_optimization_level=0".strip()
