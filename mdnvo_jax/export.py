@@ -133,6 +133,8 @@ def _about(predictor: Predictor, start: dict[str, jax.Array], results: dict[str,
         "scale_sigma_is": "relative, 1 sigma, of all translations of a run together: belongs to poses, not to steps",
         "step_correlation": None if predictor.correlation is None else predictor.correlation.tolist(),
         "step_correlation_is": "of the errors of any two steps of a run, by component; for covariances of poses, too",
+        "serial_correlation": None if predictor.serial_correlation is None else predictor.serial_correlation.tolist(),
+        "serial_correlation_is": "of what is left of the errors of neighbouring steps, to the power of their distance",
         "checkpoint": predictor.source,
         "versions": {"mdnvo_jax": mdnvo_jax.__version__, "jax": jax.__version__},
     }

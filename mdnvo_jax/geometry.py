@@ -295,6 +295,47 @@ def shared_covariance(poses: Array, directions: Array) -> Array:
     return xp.concatenate([zero, _matmul(xp, jacobian, _transpose(jacobian))], axis=-3)
 
 
+def serial_covariance(T_steps: Array, directions: Array, correlation: Array) -> Array:
+    """Covariance that poses gain, `[..., N + 1, 6, 6]`, because errors of neighbouring steps are alike.
+
+    The right perturbation of step k is D_k e_k, D `[..., N, 6, M]`, where e `[M]` is an autoregressive process of first
+    order: each e_m ~ N(0, 1), and of any two steps E[e_mk e_ml] = r_m^|k - l|, r `[M]` from 0 to 1. Steps by themselves
+    (k = l) are left out: those are `propagate_covariance`'s. With F_k = Ad(T_{k-1,k}^-1) and X_k = cov(pose k, e_k),
+
+        S_k = F_k S_{k-1} F_k^T + Y_k + Y_k^T,   Y_k = F_k X_{k-1} R D_k^T,   X_k = F_k X_{k-1} R + D_k,   R = diag(r).
+
+    Args:
+      T_steps: mean steps `[..., N, 4, 4]`.
+      directions: D.
+      correlation: r.
+    """
+    xp, T_steps, directions, decay = _inputs(
+        (T_steps, (None, 4, 4)), (directions, (None, 6, None)), (correlation, (None,))
+    )
+    carry, added = xp.moveaxis(adjoint(inverse(T_steps)), -3, 0), xp.moveaxis(directions, -3, 0)
+    start = (xp.zeros_like(carry[0]), xp.zeros_like(added[0])) if len(carry) else None
+
+    def advance(before: Any, step: tuple[Any, Any]) -> tuple[Any, Any]:
+        gained, with_error = before
+        F, D = step
+        kept = _matmul(xp, F, with_error) * decay
+        cross = _matmul(xp, kept, _transpose(D))
+        after = _sandwich(xp, F, gained) + cross + _transpose(cross)
+        return (after, kept + D), after
+
+    if start is None:
+        return xp.zeros((*T_steps.shape[:-3], 1, 6, 6), T_steps.dtype)
+    if xp is np:
+        states = [start]
+        for step in zip(carry, added, strict=True):
+            states.append(advance(states[-1], step)[0])
+        path = np.stack([state[0] for state in states])
+    else:
+        _, after = jax.lax.scan(advance, start, (carry, added))
+        path = xp.concatenate([start[0][None], after])
+    return xp.moveaxis(path, 0, -3)
+
+
 def _then(earlier: tuple[Any, Any], later: tuple[Any, Any]) -> tuple[Any, Any]:
     """Two stretches of path as one: P -> F P F^T + Q composed with itself."""
     (F_earlier, Q_earlier), (F_later, Q_later) = earlier, later

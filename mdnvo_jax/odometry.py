@@ -36,6 +36,7 @@ class Trajectory:
       coupling: how that density combines its dimensions.
       scale_sigma: relative standard deviation of the error of scale that all steps share; see `trajectory`.
       correlation: of the errors of any two steps, by component, `[6]`; see `trajectory`.
+      serial_correlation: of what is left of the errors of neighbouring steps, by component, `[6]`; likewise.
       about: what else belongs in summary.json.
     """
 
@@ -49,6 +50,7 @@ class Trajectory:
     coupling: Coupling
     scale_sigma: float = 0.0
     correlation: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(6))
+    serial_correlation: np.ndarray = dataclasses.field(default_factory=lambda: np.zeros(6))
     about: dict[str, Any] = dataclasses.field(default_factory=dict)
 
     @property
@@ -96,20 +98,23 @@ def trajectory(
     order: Literal[1, 2] = 1,
     scale_sigma: float = 0.0,
     correlation: np.ndarray | None = None,
+    serial_correlation: np.ndarray | None = None,
 ) -> Trajectory:
     """Integrate the densities of consecutive steps (equation 8) and propagate their covariance.
 
     Errors of steps average out along the path as far as they are independent. What all steps of a run are wrong by
-    together, because the road, the lens or the mount is unlike the training's, does not. Two kinds of it are known:
+    together, because the road, the lens or the mount is unlike the training's, does not, and what neighbouring steps
+    are wrong by together, because they see the same frames and the same road, does so more slowly:
 
     - A scale that is off: true translations are (1 + e) times the given ones, e ~ N(0, scale_sigma^2).
     - Errors of component k of any two steps that have the correlation rho_k: of its variance sigma_k^2 the share rho_k
-      is one error for the whole run, in units of sigma_k, and the rest is independent from step to step.
+      is one error for the whole run, in units of sigma_k.
+    - The rest, of which steps l apart have the correlation r_k^l: 0 is independent from step to step.
 
-    They are in the covariance of poses (`geometry.scale_covariance`, `geometry.shared_covariance`). The steps and their
-    sigmas stay as they are: they are meant to hold for each step by itself, whatever its error comes from. So the
-    scale's share in a single step is in a pose's covariance twice, once as if independent: of n steps alike that is at
-    most one part in n of the scale's term.
+    They are in the covariance of poses (`geometry.scale_covariance`, `shared_covariance`, `serial_covariance`). The
+    steps and their sigmas stay as they are: they are meant to hold for each step by itself, whatever its error comes
+    from. So the scale's share in a single step is in a pose's covariance twice, once as if independent: of n steps
+    alike that is at most one part in n of the scale's term.
 
     Args:
       steps: logits `[N-1, M]`, mean and log_scale `[N-1, M, 6]`, in metres and radians.
@@ -120,25 +125,28 @@ def trajectory(
         component.
       order: of the covariance propagation, 1 or 2; see `geometry.propagate_covariance`.
       scale_sigma: see above, 0 or more.
-      correlation: rho of each component, `[6]`, from 0 to 1; None for independent steps.
+      correlation: rho of each component, `[6]`, from 0 to 1; None for 0.
+      serial_correlation: r of each component, likewise.
 
     Raises:
       InputError: `scale_sigma` is no number of 0 or more.
-      ValueError: `correlation` is not of that shape or range.
+      ValueError: a correlation is not of that shape or range.
     """
     check_scale_sigma(scale_sigma)
-    correlation = np.zeros(6) if correlation is None else np.asarray(correlation, np.float64)
-    if correlation.shape != (6,) or not ((correlation >= 0) & (correlation <= 1)).all():
-        raise ValueError(f"correlation is {correlation}: expected six numbers from 0 to 1")
+    correlation, serial_correlation = _six(correlation, "correlation"), _six(serial_correlation, "serial_correlation")
     leaves: list[Any] = [np.asarray(leaf, np.float64) for leaf in steps]
     steps = Mixture(*leaves)
     reported = mixture.strongest(steps) if estimate == "strongest" else steps
     vectors = np.asarray(mixture.mean(reported), np.float64)
     covariance = np.asarray(mixture.covariance(reported, coupling=coupling), np.float64)
     matrices = geometry.step_to_matrix(vectors)
+    sigma = np.sqrt(np.diagonal(covariance, axis1=-2, axis2=-1))
     alone = np.sqrt(1 - correlation)
     perturbation = geometry.step_covariance_to_perturbation(vectors, alone[:, None] * covariance * alone)
-    together = np.sqrt(correlation * np.diagonal(covariance, axis1=-2, axis2=-1))
+    to_perturbation = geometry.step_jacobian(vectors)
+    # Errors of components that go together are made of six that do not, each as near to its component as can be.
+    share, axes = np.linalg.eigh(covariance / (sigma[:, :, None] * sigma[:, None, :]))
+    apart = (axes * np.sqrt(np.maximum(share, 0))[:, None, :]) @ np.swapaxes(axes, -1, -2)
     count = len(vectors) + 1
     poses = np.asarray(geometry.accumulate(matrices))
     propagated = np.asarray(geometry.propagate_covariance(matrices, perturbation, order=order))
@@ -146,7 +154,10 @@ def trajectory(
         poses=poses,
         covariance=propagated
         + geometry.scale_covariance(poses, scale_sigma)
-        + geometry.shared_covariance(poses, geometry.step_jacobian(vectors) * together[:, None, :]),
+        + geometry.shared_covariance(poses, to_perturbation * (np.sqrt(correlation) * sigma)[:, None, :])
+        + geometry.serial_covariance(
+            matrices, to_perturbation @ ((alone * sigma)[:, :, None] * apart), serial_correlation
+        ),
         steps=vectors,
         step_covariance=covariance,
         timestamps=np.arange(count, dtype=np.float64) if timestamps is None else np.asarray(timestamps, np.float64),
@@ -155,8 +166,16 @@ def trajectory(
         coupling=coupling,
         scale_sigma=float(scale_sigma),
         correlation=correlation,
+        serial_correlation=serial_correlation,
         about={"estimate": estimate, "timestamps": "frame numbers" if timestamps is None else "given"},
     )
+
+
+def _six(correlation: np.ndarray | None, name: str) -> np.ndarray:
+    correlation = np.zeros(6) if correlation is None else np.asarray(correlation, np.float64)
+    if correlation.shape != (6,) or not ((correlation >= 0) & (correlation <= 1)).all():
+        raise ValueError(f"{name} is {correlation}: expected six numbers from 0 to 1")
+    return correlation
 
 
 def check_scale_sigma(sigma: float) -> None:
@@ -248,5 +267,6 @@ def _summary(path: Trajectory) -> dict[str, Any]:
         "coupling": path.coupling,
         "scale_sigma": path.scale_sigma,
         "step_correlation": dict(zip(COMPONENTS, path.correlation.tolist(), strict=True)),
+        "serial_correlation": dict(zip(COMPONENTS, path.serial_correlation.tolist(), strict=True)),
         **path.about,
     }

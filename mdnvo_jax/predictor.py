@@ -57,6 +57,7 @@ class Predictor(NamedTuple):
       scale_sigma: relative standard deviation of the error of scale that the steps of a run share; 0 where none was
         fitted. It belongs to absolute poses, see `odometry.trajectory`; what is said of single steps is without it.
       correlation: of the errors of any two steps, by component, `[6]`; likewise. None where none was fitted.
+      serial_correlation: of what is left of those of neighbouring steps, `[6]`; likewise.
       camera_height_m: height of the camera that translations are for, where `load` was told one.
     """
 
@@ -72,6 +73,7 @@ class Predictor(NamedTuple):
     sigma_scale: np.ndarray | None = None
     scale_sigma: float = 0.0
     correlation: np.ndarray | None = None
+    serial_correlation: np.ndarray | None = None
     camera_height_m: float | None = None
 
 
@@ -109,6 +111,7 @@ def load(
         sigma_scale=None if found is None else found.scale,
         scale_sigma=0.0 if found is None else found.scale_sigma,
         correlation=None if found is None else found.correlation,
+        serial_correlation=None if found is None else found.serial_correlation,
         camera_height_m=camera_height_m,
     )
 
@@ -171,6 +174,7 @@ def from_model(
     sigma_scale: np.ndarray | None = None,
     scale_sigma: float = 0.0,
     correlation: np.ndarray | None = None,
+    serial_correlation: np.ndarray | None = None,
     camera_height_m: float | None = None,
 ) -> Predictor:
     """Return a predictor of a model in memory; the arguments are those of `load` and `Predictor`."""
@@ -211,6 +215,7 @@ def from_model(
         sigma_scale=sigma_scale,
         scale_sigma=scale_sigma,
         correlation=correlation,
+        serial_correlation=serial_correlation,
         camera_height_m=camera_height_m,
     )
 
@@ -306,6 +311,7 @@ def predict(
         estimate=estimate,
         scale_sigma=scale_sigma,
         correlation=predictor.correlation,
+        serial_correlation=predictor.serial_correlation,
     )
     about = {
         **result.about,

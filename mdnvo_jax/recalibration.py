@@ -17,9 +17,9 @@ from mdnvo_jax.odometry import COMPONENTS
 
 # In the folder of a step, so that it is copied and deleted with the weights and never meets others.
 FILE = "sigma_scale.json"
-# Raised when what is stored, or its meaning, changes. Version 1 has factors alone.
-VERSION = 2
-_READABLE = (1, VERSION)
+# Raised when what is stored, or its meaning, changes. Version 1 has factors alone, 2 no serial correlation.
+VERSION = 3
+_READABLE = (1, 2, VERSION)
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,8 @@ class SigmaScale:
       fitted_on: which data, in words and names.
       scale_sigma: relative standard deviation of the error of scale that a drive's steps share; 0 where none was found.
       correlation: of the errors of any two steps of a drive, without that of the scale, by component, `[6]`.
-      drives: how many these two were fitted on.
+      serial_correlation: of what is left of those of neighbouring steps, likewise.
+      drives: how many these three were fitted on.
     """
 
     scale: np.ndarray
@@ -44,6 +45,7 @@ class SigmaScale:
     fitted_on: Mapping[str, Any]
     scale_sigma: float = 0.0
     correlation: np.ndarray = field(default_factory=lambda: np.zeros(len(COMPONENTS)))
+    serial_correlation: np.ndarray = field(default_factory=lambda: np.zeros(len(COMPONENTS)))
     drives: int = 0
 
 
@@ -63,6 +65,8 @@ def read(step_folder: str | Path) -> SigmaScale | None:
             raise InputError(f"{path} has version {stored['version']}, expected {VERSION}: {mend}")
         if stored["version"] == 1:
             stored |= {"scale_sigma": 0.0, "correlation": [0.0] * len(COMPONENTS), "drives": 0}
+        if stored["version"] <= 2:
+            stored |= {"serial_correlation": [0.0] * len(COMPONENTS)}
         scale = np.array(stored["scale"], np.float64)
         found = SigmaScale(
             scale=scale,
@@ -72,6 +76,7 @@ def read(step_folder: str | Path) -> SigmaScale | None:
             fitted_on=dict(stored["fitted_on"]),
             scale_sigma=float(stored["scale_sigma"]),
             correlation=np.array(stored["correlation"], np.float64),
+            serial_correlation=np.array(stored["serial_correlation"], np.float64),
             drives=int(stored["drives"]),
         )
     except InputError:
@@ -82,8 +87,10 @@ def read(step_folder: str | Path) -> SigmaScale | None:
         raise InputError(f"{path}: scale {scale.tolist()}: expected six factors above 0: {mend}")
     if not (np.isfinite(found.scale_sigma) and found.scale_sigma >= 0):
         raise InputError(f"{path}: scale_sigma {found.scale_sigma}: expected 0 or more: {mend}")
-    if found.correlation.shape != scale.shape or not ((found.correlation >= 0) & (found.correlation <= 1)).all():
-        raise InputError(f"{path}: correlation {found.correlation.tolist()}: expected six numbers from 0 to 1: {mend}")
+    for name in ("correlation", "serial_correlation"):
+        value = getattr(found, name)
+        if value.shape != scale.shape or not ((value >= 0) & (value <= 1)).all():
+            raise InputError(f"{path}: {name} {value.tolist()}: expected six numbers from 0 to 1: {mend}")
     return found
 
 
@@ -99,6 +106,7 @@ def write(step_folder: str | Path, found: SigmaScale, **about: Any) -> Path:
         "nll_after": found.nll_after,
         "scale_sigma": found.scale_sigma,
         "correlation": found.correlation.tolist(),
+        "serial_correlation": found.serial_correlation.tolist(),
         "drives": found.drives,
         "fitted_on": dict(found.fitted_on),
         **about,

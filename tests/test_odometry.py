@@ -160,16 +160,51 @@ def test_a_monte_carlo_over_correlated_steps_has_the_covariance_that_is_told() -
     assert np.trace(np.linalg.solve(path.covariance[-1], np.cov(errors.T))) / 6 == pytest.approx(1, abs=0.1)
 
 
+def test_errors_that_neighbours_share_average_out_slowly() -> None:
+    sigma = np.array([0.01, 0.02, 0.1, 1e-9, 1e-9, 1e-9])
+    straight = gaussian_steps(np.tile([0, 0, 2.0, 0, 0, 0], (100, 1)), sigma)
+    serial = np.array([0.9, 0.0, 1.0, 0, 0, 0])
+    path = odometry.trajectory(straight, coupling="joint", serial_correlation=serial)
+    found = np.sqrt(np.diagonal(path.covariance, axis1=1, axis2=2))
+    for count in (1, 2, 10, 100):
+        apart = np.abs(np.subtract.outer(np.arange(count), np.arange(count)))
+        expected = [s * np.sqrt((r**apart).sum()) for s, r in zip(sigma[:3], serial, strict=False)]
+        np.testing.assert_allclose(found[count, :3], expected, rtol=1e-6)
+
+
+def test_a_monte_carlo_over_all_that_steps_share_has_the_covariance_that_is_told() -> None:
+    generator = np.random.default_rng(4)
+    count, draws = 25, 4000
+    scale = np.array([0.01, 0.01, 0.03, 0.001, 0.004, 0.001])
+    serial = np.array([0.9, 0.0, 0.6, 0.8, 0.95, 0.3])
+    mean = np.tile([0.02, 0, 1, 0, 0.05, 0], (count, 1)).astype(float)
+    steps = gaussian_steps(mean, scale)
+    path = odometry.trajectory(steps, coupling="joint", correlation=RHO, serial_correlation=serial)
+    samples = np.tile(np.eye(4), (draws, 1, 1))
+    shared, wander = generator.normal(size=(2, draws, 6))
+    for index in range(count):
+        error = np.sqrt(RHO) * shared + np.sqrt(1 - RHO) * wander
+        samples = samples @ geometry.step_to_matrix(mean[index] + scale * error)
+        wander = serial * wander + np.sqrt(1 - serial**2) * generator.normal(size=(draws, 6))
+    errors = geometry.log_se3(geometry.inverse(path.poses[-1]) @ samples)
+    assert np.trace(np.linalg.solve(path.covariance[-1], np.cov(errors.T))) / 6 == pytest.approx(1, abs=0.1)
+    without = odometry.trajectory(steps, coupling="joint", correlation=RHO).covariance[-1]
+    assert np.trace(np.linalg.solve(without, np.cov(errors.T))) / 6 > 1.5
+
+
 def test_the_correlation_of_steps_does_not_matter_after_the_first() -> None:
     # A large turn, so that the axes of the two frames differ.
     turn = gaussian_steps(np.array([[0.3, -0.1, 1, 0.4, 1.2, -0.3]]), np.array([0.01, 0.02, 0.1, 0.01, 0.03, 0.05]))
-    alone, together = (odometry.trajectory(turn, coupling="joint", correlation=rho) for rho in (None, RHO))
+    alone, together = (
+        odometry.trajectory(turn, coupling="joint", correlation=rho, serial_correlation=rho) for rho in (None, RHO)
+    )
     np.testing.assert_allclose(together.covariance, alone.covariance, atol=1e-15)
 
 
 def test_correlated_components_of_a_step_stay_a_covariance() -> None:
     """A joint density couples components; taking a share of some variances must leave a covariance."""
-    path = odometry.trajectory(densities(20), coupling="joint", correlation=np.array([1, 0, 0.5, 0.9, 0, 0.99]))
+    some = np.array([1, 0, 0.5, 0.9, 0, 0.99])
+    path = odometry.trajectory(densities(20), coupling="joint", correlation=some, serial_correlation=some[::-1])
     assert np.all(np.linalg.eigvalsh(path.covariance[1:]) > 0)
 
 
@@ -177,6 +212,8 @@ def test_correlated_components_of_a_step_stay_a_covariance() -> None:
 def test_correlations_that_are_none_are_named(correlation: np.ndarray) -> None:
     with pytest.raises(ValueError, match="six numbers from 0 to 1"):
         odometry.trajectory(densities(3), coupling="joint", correlation=correlation)
+    with pytest.raises(ValueError, match="serial_correlation is"):
+        odometry.trajectory(densities(3), coupling="joint", serial_correlation=correlation)
 
 
 @pytest.mark.parametrize("sigma", [-0.01, float("nan"), float("inf")])
@@ -193,6 +230,7 @@ def test_the_files_hold_the_trajectory(tmp_path: Path) -> None:
         flags=["held"] + [""] * 11,
         scale_sigma=0.05,
         correlation=np.array([0, 0, 0, 0, 0.25, 0]),
+        serial_correlation=np.array([0.5, 0, 0, 0, 0, 0]),
     )
     path.save(tmp_path / "out")
     names = {entry.name for entry in (tmp_path / "out").iterdir()}
@@ -233,7 +271,7 @@ def test_the_files_hold_the_trajectory(tmp_path: Path) -> None:
     assert summary["flagged_steps"] == 1
     assert summary["coupling"] == "joint"
     assert summary["scale_sigma"] == 0.05
-    assert summary["step_correlation"]["ry"] == 0.25
+    assert summary["step_correlation"]["ry"] == 0.25 and summary["serial_correlation"]["tx"] == 0.5
 
 
 def test_results_are_not_overwritten_by_accident(tmp_path: Path) -> None:

@@ -19,7 +19,7 @@ from mdnvo_jax.errors import InputError
 from mdnvo_jax.evaluation.calibration import SIGMA_LEVELS, StepScores, fit_sigma_scale, is_inside, score
 from mdnvo_jax.evaluation.calibration_tables import NOMINAL
 from mdnvo_jax.evaluation.model import track
-from mdnvo_jax.evaluation.shared_errors import fit_correlation, fit_scale_sigma, scale_error
+from mdnvo_jax.evaluation.shared_errors import fit_correlations, fit_scale_sigma, scale_error
 from mdnvo_jax.evaluation.tables import Column, Row, Table, Value
 from mdnvo_jax.mixture import Coupling, Mixture, widen
 from mdnvo_jax.odometry import COMPONENTS
@@ -121,6 +121,10 @@ def fit(
     before = score(density, truth, coupling=coupling)
     after = score(widen(density, scale), truth, coupling=coupling)
     together = _errors_together(predictions, coupling, scale)
+    products, squares = together.neighbours.sum(axis=0), together.squares.sum(axis=0)
+    # Drives of one step have no neighbours.
+    neighbours = np.divide(products, squares, out=np.zeros_like(products), where=squares > 0)
+    correlation, serial_correlation = fit_correlations(together.rest, together.steps, neighbours)
     found = SigmaScale(
         scale=scale,
         steps=len(truth),
@@ -128,7 +132,8 @@ def fit(
         nll_after=float(after.nll.mean()),
         fitted_on=fitted_on | {"scale_errors": together.scale.tolist(), "fitted_scale": fitted.tolist()},
         scale_sigma=fit_scale_sigma(together.scale, together.variance),
-        correlation=fit_correlation(together.rest, together.steps),
+        correlation=correlation,
+        serial_correlation=serial_correlation,
         drives=len(predictions),
     )
     return found, _table(found, before, after)
@@ -142,12 +147,16 @@ class _Together(NamedTuple):
       variance: of that, `[D]`.
       rest: mean of the standardised errors that are left without it, `[D, 6]`.
       steps: in each drive, `[D]`.
+      neighbours: sum of the products of those errors of neighbouring steps, `[D, 6]`.
+      squares: sum of the mean squares of the same steps, `[D, 6]`.
     """
 
     scale: np.ndarray
     variance: np.ndarray
     rest: np.ndarray
     steps: np.ndarray
+    neighbours: np.ndarray
+    squares: np.ndarray
 
 
 def _errors_together(predictions: Many[tuple[Mixture, np.ndarray]], coupling: Coupling, scale: np.ndarray) -> _Together:
@@ -160,14 +169,17 @@ def _errors_together(predictions: Many[tuple[Mixture, np.ndarray]], coupling: Co
         error, variance = scale_error(mean, covariance, truth)
         without = np.concatenate([(1 + error) * mean[:, :3], mean[:, 3:]], axis=1)
         standardised = (truth - without) / np.sqrt(np.diagonal(covariance, axis1=1, axis2=2))
-        rows.append((error, variance, standardised.mean(axis=0), len(truth)))
+        products = (standardised[1:] * standardised[:-1]).sum(axis=0)
+        squares = (standardised[1:] ** 2 + standardised[:-1] ** 2).sum(axis=0) / 2
+        rows.append((error, variance, standardised.mean(axis=0), len(truth), products, squares))
     return _Together(*(np.array(column) for column in zip(*rows, strict=True)))
 
 
 def _table(found: SigmaScale, before: StepScores, after: StepScores) -> Table:
     """Return a row a component: its factor, and the share of truths inside intervals before and after."""
     columns = [Column("component", "component"), Column("factor", "sigma times", 3)]
-    columns.append(Column("correlation", "correlation between steps", 3))
+    columns.append(Column("correlation", "correlation of any two steps", 3))
+    columns.append(Column("serial_correlation", "and of neighbours beyond that", 3))
     for level, nominal in enumerate(NOMINAL):
         columns += [
             Column(f"{when}_{level}", f"in {level + 1} sigma, {when} ({nominal:.2f} %)", 1)
@@ -183,6 +195,7 @@ def _table(found: SigmaScale, before: StepScores, after: StepScores) -> Table:
             "component": name,
             "factor": Value(float(found.scale[k])),
             "correlation": Value(float(found.correlation[k])),
+            "serial_correlation": Value(float(found.serial_correlation[k])),
             **{key: Value(float(values[k])) for key, values in shares.items()},
         }
         for k, name in enumerate(COMPONENTS)

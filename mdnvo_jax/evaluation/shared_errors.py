@@ -67,17 +67,32 @@ def fit_scale_sigma(errors: np.ndarray, variances: np.ndarray) -> float:
     return float(np.exp(best)) if nll(best) < nll(-np.inf) else 0.0
 
 
-def fit_correlation(means: np.ndarray, counts: np.ndarray) -> np.ndarray:
-    """Correlation of the errors of any two steps of a drive, by component, `[K]`, by maximum likelihood.
+def fit_correlations(means: np.ndarray, counts: np.ndarray, neighbours: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How alike the errors of the steps of a drive are, by component, `[K]` each, by maximum likelihood.
 
-    Of standardised errors z with E[z^2] = 1 and that correlation rho, the mean over the n steps of a drive has the
-    variance rho + (1 - rho) / n; so z_i ~ N(0, rho + (1 - rho) / n_i) over the drives i. To a thousandth, below 1.
+    Of standardised errors z with E[z^2] = 1, those of two steps l apart have the correlation rho + (1 - rho) r^l: rho
+    is of any two, r of what is left of neighbours. That of neighbours is measured, c = rho + (1 - rho) r, which leaves
+    rho, to a thousandth, no more than c. The mean of the n steps of a drive then has the variance
+
+        rho + (1 - rho) (1 + 2 sum_{l < n} (1 - l / n) r^l) / n,
+
+    and z_i ~ N(0, that of n_i) over the drives i.
 
     Args:
       means: of the standardised errors of each drive, `[D, K]`.
       counts: steps in each drive, `[D]`.
+      neighbours: c, `[K]`; below 0 counts as 0, and 0.999 is the most.
+
+    Returns:
+      (rho, r).
     """
-    rho = np.arange(1000)[:, None, None] / 1000
-    variance = rho + (1 - rho) / counts[:, None]
+    together = np.clip(neighbours, 0, 0.999)
+    rho = np.arange(1000)[:, None] / 1000
+    left = np.maximum(together - rho, 0) / (1 - rho)
+    power, number = left[:, None, :], counts[:, None]
+    # The sum in closed form: n (1 + r) / (1 - r) - 2 r (1 - r^n) / (1 - r)^2, over n.
+    spread = (1 + power) / (1 - power) - 2 * power * (1 - power**number) / (number * (1 - power) ** 2)
+    variance = rho[:, None] + (1 - rho[:, None]) * spread / number
     nll = (np.log(variance) + means**2 / variance).sum(axis=1)
-    return rho[nll.argmin(axis=0), 0, 0]
+    best = np.where(rho <= together, nll, np.inf).argmin(axis=0)
+    return rho[best, 0], left[best, np.arange(left.shape[1])]

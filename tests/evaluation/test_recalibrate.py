@@ -72,7 +72,9 @@ def run(*arguments):
 
 def some_scale():
     about = {"split": "validation split of the training", "sequences": ["00"]}
-    return SigmaScale(SCALE, 10, 1.0, 0.5, about, scale_sigma=0.06, correlation=RHO, drives=3)
+    return SigmaScale(
+        SCALE, 10, 1.0, 0.5, about, scale_sigma=0.06, correlation=RHO, serial_correlation=RHO / 2, drives=3
+    )
 
 
 def test_a_mixture_too_sure_by_two_is_widened_by_two():
@@ -160,11 +162,13 @@ def test_the_correlation_of_steps_is_found_beside_the_error_of_scale():
     assert found.correlation[2] < 0.01
     assert found.scale_sigma == pytest.approx(0.06, rel=0.25)
     assert table.rows[0]["correlation"].value == found.correlation[0]
+    # Neighbours are no more alike than any two.
+    assert found.serial_correlation.max() < 0.2
     # The covariance of the end then holds what the drives were off by.
     nees = {"independent": [], "together": []}
     for density, truth in parts:
         for name, more in (
-            ("independent", {}), ("together", {"scale_sigma": found.scale_sigma, "correlation": found.correlation})
+            ("independent", {}), ("together", {"scale_sigma": found.scale_sigma, "correlation": found.correlation}),
         ):  # fmt: skip
             path = odometry.trajectory(widen(density, found.scale), coupling="joint", **more)
             end = geometry.accumulate(geometry.step_to_matrix(truth))[-1]
@@ -237,7 +241,9 @@ def test_every_sigma_is_multiplied_and_nothing_else(workdir, root, mode):
     own = predictor.predict(predictor.load(workdir), frames, mode=mode, scale_sigma=0.0)
     added = after.covariance - own.covariance
     np.testing.assert_allclose(added, geometry.scale_covariance(after.poses, 0.06), atol=1e-9)
-    again = odometry.trajectory(after.mixture, coupling=after.coupling, scale_sigma=0.06, correlation=RHO)
+    again = odometry.trajectory(
+        after.mixture, coupling=after.coupling, scale_sigma=0.06, correlation=RHO, serial_correlation=RHO / 2
+    )
     np.testing.assert_allclose(after.covariance, again.covariance, rtol=1e-9)
     np.testing.assert_array_equal((before.correlation, after.correlation), (np.zeros(6), RHO))
     # The density has the same shape: its components are as many sigmas from the mean as they were.
@@ -295,6 +301,7 @@ def test_the_training_goes_on_beside_the_file(workdir):
         ({"scale_sigma": None}, "damaged"),
         ({"correlation": [0, 0, 0, 0, 0, 1.5]}, "six numbers from 0 to 1"),
         ({"correlation": [0, 0]}, "six numbers from 0 to 1"),
+        ({"serial_correlation": [-0.1, 0, 0, 0, 0, 0]}, "serial_correlation .* six numbers from 0 to 1"),
     ],
 )
 def test_a_damaged_file_is_named(tmp_path, change, message):
@@ -310,11 +317,21 @@ def test_a_file_of_the_first_version_has_factors_alone(tmp_path):
     path = recalibration.write(tmp_path, some_scale())
     assert (recalibration.read(tmp_path).scale_sigma, recalibration.read(tmp_path).drives) == (0.06, 3)
     stored = json.loads(path.read_text())
-    later = ("scale_sigma", "correlation", "drives")
+    later = ("scale_sigma", "correlation", "serial_correlation", "drives")
     path.write_text(json.dumps({name: stored[name] for name in stored if name not in later} | {"version": 1}))
     found = recalibration.read(tmp_path)
     assert (found.scale_sigma, found.drives, found.scale.tolist()) == (0, 0, SCALE.tolist())
-    np.testing.assert_array_equal(found.correlation, np.zeros(6))
+    np.testing.assert_array_equal((found.correlation, found.serial_correlation), np.zeros((2, 6)))
+
+
+def test_a_file_of_the_second_version_has_no_serial_correlation(tmp_path):
+    path = recalibration.write(tmp_path, some_scale())
+    np.testing.assert_array_equal(recalibration.read(tmp_path).serial_correlation, RHO / 2)
+    stored = json.loads(path.read_text())
+    del stored["serial_correlation"]
+    path.write_text(json.dumps(stored | {"version": 2}))
+    found = recalibration.read(tmp_path)
+    np.testing.assert_array_equal((found.correlation, found.serial_correlation), (RHO, np.zeros(6)))
 
 
 def test_no_step_no_fit():

@@ -144,6 +144,24 @@ def test_errors_that_steps_share_by_their_definition(lib: SimpleNamespace) -> No
     np.testing.assert_allclose(both[1], 4 * both[0], rtol=1e-12, atol=1e-12)
 
 
+def test_errors_that_neighbours_share_by_their_definition(lib: SimpleNamespace) -> None:
+    """All pairs of different steps: J_k D_k R^|k - l| D_l^T J_l^T, J_k what step k does to the pose."""
+    rng = np.random.default_rng(12)
+    T_steps = geo.step_to_matrix(steps(6, seed=13, size=0.5))
+    directions, r = rng.normal(size=(6, 6, 3)), np.array([0.0, 0.6, 1.0])
+    poses = geo.accumulate(T_steps)
+    found = lib.serial_covariance(T_steps, directions, r)
+    for pose in range(7):
+        columns = [geo.adjoint(geo.inverse(poses[pose]) @ poses[k + 1]) @ directions[k] for k in range(pose)]
+        pairs = [(k, other) for k in range(pose) for other in range(pose) if k != other]
+        expected = sum((columns[k] * r ** abs(k - other) @ columns[other].T for k, other in pairs), np.zeros((6, 6)))
+        np.testing.assert_allclose(found[pose], expected, atol=1e-9)
+    # Batches of paths, and no step at all.
+    both = lib.serial_covariance(np.stack([T_steps, T_steps]), np.stack([directions, 2 * directions]), r)
+    np.testing.assert_allclose(both[1], 4 * both[0], rtol=1e-12, atol=1e-12)
+    np.testing.assert_array_equal(lib.serial_covariance(T_steps[:0], directions[:0], r), np.zeros((1, 6, 6)))
+
+
 def test_an_error_of_scale_is_one_that_steps_share(lib: SimpleNamespace) -> None:
     vectors = steps(8, seed=11)
     poses = geo.accumulate(geo.step_to_matrix(vectors))
