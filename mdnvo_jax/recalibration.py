@@ -34,8 +34,8 @@ class SigmaScale:
       fitted_on: which data, in words and names.
       scale_sigma: relative standard deviation of the error of scale that a drive's steps share; 0 where none was found.
       correlation: of the errors of any two steps of a drive, without that of the scale, by component, `[6]`.
-      serial_correlation: of what is left of those of neighbouring steps, likewise.
-      drives: how many these three were fitted on.
+      drives: how many these two and the next were fitted on.
+      serial_correlation: of what is left of the errors of neighbouring steps, likewise.
     """
 
     scale: np.ndarray
@@ -45,8 +45,8 @@ class SigmaScale:
     fitted_on: Mapping[str, Any]
     scale_sigma: float = 0.0
     correlation: np.ndarray = field(default_factory=lambda: np.zeros(len(COMPONENTS)))
-    serial_correlation: np.ndarray = field(default_factory=lambda: np.zeros(len(COMPONENTS)))
     drives: int = 0
+    serial_correlation: np.ndarray = field(default_factory=lambda: np.zeros(len(COMPONENTS)))
 
 
 def read(step_folder: str | Path) -> SigmaScale | None:
