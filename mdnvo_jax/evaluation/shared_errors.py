@@ -18,8 +18,7 @@ def scale_error(steps: np.ndarray, covariance: np.ndarray, truth: np.ndarray) ->
 
     The sums leave out steps that truly stand (below `drift.STANDING_M`): where a car stands and is said to creep, all
     of the creep is wrong, and no scale would mend it. Errors of steps that are alike for a while count as scale as far
-    as they do not average out over the drive, as they must: `odometry.trajectory` treats all that is not scale as
-    independent.
+    as they do not average out over the drive.
 
     Args:
       steps: predicted, `[n, 6]`, or their translations `[n, 3]`, m.
