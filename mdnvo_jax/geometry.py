@@ -16,6 +16,7 @@ gradients are exact at and near zero rotation.
 """
 
 import math
+from collections.abc import Callable
 from typing import Any, Literal, TypeVar
 
 import jax
@@ -249,18 +250,11 @@ def propagate_covariance(
     # Steps to the front, for scans; what each does to a perturbation of the pose before it.
     carry, added = xp.moveaxis(adjoint(inverse(T_steps)), -3, 0), xp.moveaxis(noise, -3, 0)
 
-    def advance(before: Any, step: tuple[Any, Any]) -> tuple[Any, Any]:
-        after = _compound(xp, _sandwich(xp, step[0], before), step[1], order)
-        return after, after
+    def advance(before: Any, step: tuple[Any, Any]) -> Any:
+        return _compound(xp, _sandwich(xp, step[0], before), step[1], order)
 
-    if xp is np:
-        path = [start]
-        for step in zip(carry, added, strict=True):
-            path.append(advance(path[-1], step)[0])
-        covariances = np.stack(path)
-    elif order == 2:
-        _, after = jax.lax.scan(advance, start, (carry, added))
-        covariances = jnp.concatenate([start[None], after])
+    if xp is np or order == 2:
+        covariances = _along(xp, advance, start, (carry, added))
     else:
         identity = jnp.broadcast_to(jnp.eye(6, dtype=start.dtype), start.shape)
         chain = (jnp.concatenate([identity[None], carry]), jnp.concatenate([start[None], added]))
@@ -313,27 +307,27 @@ def serial_covariance(T_steps: Array, directions: Array, correlation: Array) -> 
         (T_steps, (None, 4, 4)), (directions, (None, 6, None)), (correlation, (None,))
     )
     carry, added = xp.moveaxis(adjoint(inverse(T_steps)), -3, 0), xp.moveaxis(directions, -3, 0)
-    start = (xp.zeros_like(carry[0]), xp.zeros_like(added[0])) if len(carry) else None
 
-    def advance(before: Any, step: tuple[Any, Any]) -> tuple[Any, Any]:
+    def advance(before: tuple[Any, Any], step: tuple[Any, Any]) -> tuple[Any, Any]:
         gained, with_error = before
         F, D = step
         kept = _matmul(xp, F, with_error) * decay
         cross = _matmul(xp, kept, _transpose(D))
-        after = _sandwich(xp, F, gained) + cross + _transpose(cross)
-        return (after, kept + D), after
+        return _sandwich(xp, F, gained) + cross + _transpose(cross), kept + D
 
-    if start is None:
-        return xp.zeros((*T_steps.shape[:-3], 1, 6, 6), T_steps.dtype)
+    start = xp.zeros(carry.shape[1:], carry.dtype), xp.zeros(added.shape[1:], added.dtype)
+    return xp.moveaxis(_along(xp, advance, start, (carry, added))[0], 0, -3)
+
+
+def _along(xp: Any, advance: Callable[[Any, Any], Any], start: Any, steps: tuple[Any, ...]) -> Any:
+    """The state, an array or a tuple of them, before the first step and after every one, on a new first axis."""
     if xp is np:
         states = [start]
-        for step in zip(carry, added, strict=True):
-            states.append(advance(states[-1], step)[0])
-        path = np.stack([state[0] for state in states])
-    else:
-        _, after = jax.lax.scan(advance, start, (carry, added))
-        path = xp.concatenate([start[0][None], after])
-    return xp.moveaxis(path, 0, -3)
+        for step in zip(*steps, strict=True):
+            states.append(advance(states[-1], step))
+        return jax.tree.map(lambda *path: np.stack(path), *states)
+    _, after = jax.lax.scan(lambda before, step: (advance(before, step),) * 2, start, steps)
+    return jax.tree.map(lambda first, rest: jnp.concatenate([first[None], rest]), start, after)
 
 
 def _then(earlier: tuple[Any, Any], later: tuple[Any, Any]) -> tuple[Any, Any]:
