@@ -11,7 +11,7 @@ import numpy as np
 
 from mdnvo_jax import geometry
 from mdnvo_jax.config import Config, DataConfig, ImageConfig
-from mdnvo_jax.data import augment, images
+from mdnvo_jax.data import augment, images, overlay
 from mdnvo_jax.data.sequence import Sequence
 from mdnvo_jax.errors import InputError
 from mdnvo_jax.model.network import flow_size
@@ -283,6 +283,9 @@ def _training_window(
         frames = [augment.mirror_frame(frame, own) for frame, own in zip(frames, cameras, strict=True)]
         labels = geometry.mirror_step(labels)
         flow = None if flow is None else augment.mirror_flow(flow, camera)
+    if data.overlaid > 0 and rng.random() < data.overlaid:
+        covered, cover = overlay.cover_frames(np.stack(frames), rng)
+        frames, flow = list(covered), None if flow is None else overlay.cover_flow(flow, cover)
     if rng.random() < data.narrow:
         frames = list(augment.narrow(np.stack(frames), rng))
     if data.overexposed > 0 and rng.random() < data.overexposed:
