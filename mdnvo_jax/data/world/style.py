@@ -105,9 +105,13 @@ def stream(seed: int, name: str) -> np.random.Generator:
 
 
 def draw_style(seed: int) -> Style:
-    """Return the style of the world `seed`; the cruising speed is flat from 0 to 30 m/s over the seeds."""
+    """Return the style of the world `seed`: a tenth of them stand, some crawl, the others cruise at 1 to 30 m/s."""
     rng = stream(seed, "style")
     cruise = 0.0 if rng.random() < 0.1 else 1 + 29 * rng.random() ** 0.7
+    # Car parks, robots, and whatever drives before a camera of 30 frames a second: steps of centimetres, not metres.
+    pace = stream(seed, "pace")
+    if cruise > 0 and pace.random() < 0.12:
+        cruise = float(np.exp(pace.uniform(np.log(0.5), np.log(5))))
     # Slow worlds are towns, fast ones open roads, with a wide overlap.
     town = float(np.clip((19 - cruise) / 10 + rng.normal(0, 0.35), 0, 1))
     # But for half of those that wind: ramps and narrow bends in the open. Else a network would learn that who turns
