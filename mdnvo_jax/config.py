@@ -120,8 +120,7 @@ class DataConfig:
     photometric: float = 0.0
     # Chance that a window is exposed for the shade: what the sun lights goes white.
     overexposed: float = 0.0
-    # Chance that a window shows what moves with the camera: the hood (bonnet) of its own car, as dash cameras do, or a
-    # caption.
+    # Chance that a window has in view what moves with the camera: the hood (bonnet) of its own car, or a caption.
     overlaid: float = 0.0
     # Chance that a window is shown as a camera with a narrower view would have it, the edge repeated outwards, as
     # bringing such a camera's frames to the virtual camera does.

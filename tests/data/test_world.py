@@ -148,7 +148,7 @@ def test_speeds_are_flat_and_standing_still_is_among_them(paths):
     )
     share = np.histogram(speed, [0.5, 6, 12, 18, 24, 30])[0] / (speed > 0.5).sum()
     assert share.min() > 0.12 and share.max() < 0.3
-    # Some crawl: half of them make steps of less than 10 cm, forwards or backwards.
+    # Some crawl: half of their steps are shorter than 15 cm.
     crawling = np.flatnonzero((cruise > 0) & (cruise < 2.5))[:40]
     steps = [np.diff(road_coordinate(world.path(seed, 1)[1], FRAME_S * np.arange(100))) for seed in crawling]
     assert 0.06 < ((cruise > 0) & (cruise < 2.5)).mean() < 0.12
