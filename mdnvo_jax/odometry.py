@@ -173,9 +173,14 @@ def trajectory(
 
 def _six(correlation: np.ndarray | None, name: str) -> np.ndarray:
     correlation = np.zeros(6) if correlation is None else np.asarray(correlation, np.float64)
-    if correlation.shape != (6,) or not ((correlation >= 0) & (correlation <= 1)).all():
+    if not are_correlations(correlation):
         raise ValueError(f"{name} is {correlation}: expected six numbers from 0 to 1")
     return correlation
+
+
+def are_correlations(values: np.ndarray) -> bool:
+    """Whether `values` can be correlations of steps, by component: `[6]`, each from 0 to 1."""
+    return values.shape == (6,) and bool(((values >= 0) & (values <= 1)).all())
 
 
 def check_scale_sigma(sigma: float) -> None:

@@ -13,7 +13,7 @@ import numpy as np
 
 from mdnvo_jax import files
 from mdnvo_jax.errors import InputError
-from mdnvo_jax.odometry import COMPONENTS
+from mdnvo_jax.odometry import COMPONENTS, are_correlations
 
 # In the folder of a step, so that it is copied and deleted with the weights and never meets others.
 FILE = "sigma_scale.json"
@@ -89,7 +89,7 @@ def read(step_folder: str | Path) -> SigmaScale | None:
         raise InputError(f"{path}: scale_sigma {found.scale_sigma}: expected 0 or more: {mend}")
     for name in ("correlation", "serial_correlation"):
         value = getattr(found, name)
-        if value.shape != scale.shape or not ((value >= 0) & (value <= 1)).all():
+        if not are_correlations(value):
             raise InputError(f"{path}: {name} {value.tolist()}: expected six numbers from 0 to 1: {mend}")
     return found
 

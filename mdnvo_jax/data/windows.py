@@ -285,7 +285,8 @@ def _training_window(
         flow = None if flow is None else augment.mirror_flow(flow, camera)
     if data.overlaid > 0 and rng.random() < data.overlaid:
         covered, cover = overlay.cover_frames(np.stack(frames), rng)
-        frames, flow = list(covered), None if flow is None else overlay.cover_flow(flow, cover)
+        frames = list(covered)
+        flow = None if flow is None else overlay.cover_flow(flow, cover)
     if rng.random() < data.narrow:
         frames = list(augment.narrow(np.stack(frames), rng))
     if data.overexposed > 0 and rng.random() < data.overexposed:
