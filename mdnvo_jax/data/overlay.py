@@ -56,9 +56,9 @@ def _paint(frames: np.ndarray, cover: np.ndarray, rng: np.random.Generator) -> n
 
 
 def _caption(height: int, width: int, rng: np.random.Generator) -> np.ndarray:
-    """Return the cover of a line of 6 to 20 letters anywhere in the frame, a tenth to a fifth of it high."""
+    """Return the cover of a line of 6 to 20 letters anywhere in the frame, an eighth to a quarter of it high."""
     text = "".join(map(chr, rng.integers(ord("!"), ord("z"), rng.integers(6, 21))))
-    # The font's letters are 10 pixels high at a scale of 1.
+    # The font's capitals are some 12 pixels high at a scale of 1.
     scale = height * rng.uniform(0.1, 0.2) / 10
     place = int(rng.uniform(-0.1, 0.8) * width), int(rng.uniform(0.1, 1.0) * height)
     cover = np.zeros((height, width), np.uint8)
