@@ -58,11 +58,8 @@ def done(tmp_path_factory):
 
     overrides = [str(part) for name, value in TINY.items() for part in (f"--{name}", value)]
     given = ["--workdir", str(model), "--data.root", str(root), "--data.version", VERSION, *overrides]
-    # A process of its own, as for a user; it finds the package of this checkout, and compiles as fast as can be.
-    own = {
-        "PYTHONPATH": os.pathsep.join([str(REPOSITORY), *sys.path]),
-        "XLA_FLAGS": "--xla_backend_optimization_level=0 --xla_llvm_disable_expensive_passes=true",
-    }
+    # A process of its own, as for a user; it finds the package of this checkout.
+    own = {"PYTHONPATH": os.pathsep.join([str(REPOSITORY), *sys.path])}
     trained = subprocess.run(
         [sys.executable, "-m", "mdnvo_jax.train", "configs/mdn_vo_nuscenes.py", *given],
         cwd=REPOSITORY,
