@@ -12,10 +12,8 @@ from mdnvo_jax.model.bilstm import bilstm, init_lstm
 
 FEATURES, HIDDEN, STEPS = 5, 3, 6
 
-# Compiling takes most of the time of these tests.
-jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
-run = jit(bilstm)
-run_dropping = jit(bilstm, static_argnames="dropout")
+run = jax.jit(bilstm)
+run_dropping = jax.jit(bilstm, static_argnames="dropout")
 
 
 def random_params(layers=2, bidirectional=True, seed=0):
@@ -91,7 +89,7 @@ def test_agrees_with_torch(golden, assert_close, kind, wide, tolerance):
             outputs = bilstm(params, inputs, mask)
             return jnp.sum(outputs * recorded[f"{kind}_cotangent"]), outputs
 
-        (by_params, by_inputs), outputs = jit(jax.grad(loss, argnums=(0, 1), has_aux=True))(
+        (by_params, by_inputs), outputs = jax.jit(jax.grad(loss, argnums=(0, 1), has_aux=True))(
             ours(recorded, kind), inputs
         )
         assert outputs.dtype == dtype
@@ -141,7 +139,7 @@ def test_only_a_bidirectional_lstm_looks_ahead(bidirectional):
 
 def test_initialisation_is_xavier_gate_by_gate():
     features, hidden = 200, 100
-    params = jit(functools.partial(init_lstm, features=features, hidden=hidden, layers=2))(jax.random.key(0))
+    params = jax.jit(functools.partial(init_lstm, features=features, hidden=hidden, layers=2))(jax.random.key(0))
     assert list(params) == ["layer0", "layer1"]
     kernels = []
     for layer, inputs in (("layer0", features), ("layer1", 2 * hidden)):
@@ -181,6 +179,6 @@ def test_gradients_are_finite_and_zero_where_masked(scale):
     rng = np.random.default_rng(0)
     params, inputs = random_params(), (scale * rng.normal(size=(2, STEPS, FEATURES))).astype(np.float32)
     mask = np.array([[True, False, True, True, False, False], [False] * STEPS])
-    gradient = jit(jax.grad(lambda params, x: bilstm(params, x, mask).sum(), argnums=(0, 1)))(params, inputs)
+    gradient = jax.jit(jax.grad(lambda params, x: bilstm(params, x, mask).sum(), argnums=(0, 1)))(params, inputs)
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(gradient))
     assert (np.asarray(gradient[1])[~mask] == 0).all()

@@ -10,8 +10,6 @@ from mdnvo_jax.model.convolution import convolve
 from mdnvo_jax.model.flownet import load_stack, read_flownet, write_stack
 
 LAYER = Layer("conv", 3, 2, 4)
-# Compiling takes most of the time of these tests.
-jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +75,7 @@ def test_map_size_is_the_size_of_the_maps(height, width):
 
 
 def test_kernels_are_xavier():
-    variables = jit(lambda key: ConvBlock(Layer("c", 5, 1, 40), 40, 0.0).init(
+    variables = jax.jit(lambda key: ConvBlock(Layer("c", 5, 1, 40), 40, 0.0).init(
         key, jnp.zeros((1, 5, 5, 24)), jnp.ones(1, bool), train=False))(jax.random.key(0))  # fmt: skip
     kernel = np.asarray(variables["params"]["kernel"])
     variance = 2 / (25 * (24 + 40))
@@ -133,7 +131,7 @@ def run_train(variables, pairs, mask, cotangent):
         )
         return jnp.sum(outputs * cotangent), (outputs, updated["batch_stats"])
 
-    return jit(jax.grad(loss, argnums=(0, 1), has_aux=True))(variables["params"], pairs)
+    return jax.jit(jax.grad(loss, argnums=(0, 1), has_aux=True))(variables["params"], pairs)
 
 
 # In float64 the only difference left is that the recorded figures are float32; float32 adds its own rounding.
@@ -146,7 +144,7 @@ def test_agrees_with_torch(torch_stack, assert_close, wide, tolerance):
         pairs, mask = jnp.asarray(pairs, dtype), jnp.ones(len(pairs), bool)
 
         if wide:  # test_flownet compares it in float32
-            evaluate = jit(functools.partial(ConvStack(1 / 32, 0.1).apply, train=False))
+            evaluate = jax.jit(functools.partial(ConvStack(1 / 32, 0.1).apply, train=False))
             assert_close(evaluate(variables, pairs, mask), recorded["bn_eval"], tolerance)
 
         (by_params, by_pairs), (outputs, after) = run_train(variables, pairs, mask, jnp.asarray(recorded["cotangent"]))
@@ -174,8 +172,8 @@ def block(rng):
         outputs, updated = module.apply(variables, x, mask, train=True, mutable=["batch_stats"])
         return outputs, updated["batch_stats"]
 
-    train = jit(train)
-    evaluate = jit(lambda x, mask: module.apply(variables, x, mask, train=False))
+    train = jax.jit(train)
+    evaluate = jax.jit(lambda x, mask: module.apply(variables, x, mask, train=False))
     return x, variables, train, evaluate
 
 
@@ -202,7 +200,7 @@ def test_a_batch_that_is_all_masked_is_normalised_with_the_running_statistics(bl
     outputs, after = train(x, nothing)
     jax.tree.map(np.testing.assert_array_equal, after, variables["batch_stats"])
     np.testing.assert_allclose(outputs, evaluate(x, nothing), rtol=1e-6)
-    gradient = jit(jax.grad(lambda x: train.__wrapped__(x, nothing)[0].sum()))(x)
+    gradient = jax.jit(jax.grad(lambda x: train.__wrapped__(x, nothing)[0].sum()))(x)
     assert np.isfinite(gradient).all()
 
 
@@ -269,7 +267,7 @@ def shallow_gradient(monkeypatch):
             )
             return jnp.sum(maps[-1] ** 2), (maps, updated["batch_stats"])
 
-        (_, found), gradient = jit(jax.value_and_grad(loss, has_aux=True))(variables["params"])
+        (_, found), gradient = jax.jit(jax.value_and_grad(loss, has_aux=True))(variables["params"])
         return *found, gradient
 
     return run

@@ -12,9 +12,6 @@ from hypothesis import strategies as st
 from mdnvo_jax.model import convolution
 from mdnvo_jax.model.convolution import convolve
 
-# Compiling takes most of the time of these tests.
-jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
-
 
 def reference(x, kernel, stride, padding):
     sides = [(padding, padding)] * 2
@@ -50,7 +47,7 @@ def test_gradients_are_those_of_lax_for_any_shape(size, stride, padding, height,
         patch.setattr(convolution, "_COLUMNS_FROM_PIXELS", 0)
         patch.setattr(convolution, "_COLUMNS_VALUES", band_values)  # the small one cuts an image into bands of rows
         x, kernel = (jnp.asarray(array) for array in operands(size, height, width, 2, 3))
-        found, expected = jit(
+        found, expected = jax.jit(
             lambda x, kernel: [
                 gradients(functools.partial(function, stride=stride, padding=padding), x, kernel)
                 for function in (convolve, reference)
@@ -64,7 +61,7 @@ def test_gradients_are_those_of_lax_for_any_shape(size, stride, padding, height,
 @pytest.mark.parametrize(("size", "stride", "height", "width"), [(7, 2, 33, 40), (3, 1, 18, 17), (3, 2, 9, 10)])
 def test_float32_gradients_are_exact_to_rounding(size, stride, height, width):
     x, kernel = (np.float32(array) for array in operands(size, height, width, 6, 8))
-    run = jit(functools.partial(gradients, lambda x, kernel: convolve(x, kernel, stride, size // 2)))
+    run = jax.jit(functools.partial(gradients, lambda x, kernel: convolve(x, kernel, stride, size // 2)))
     with jax.enable_x64(True):
         exact = gradients(lambda x, kernel: reference(x, kernel, stride, size // 2), *map(np.float64, (x, kernel)))
     for ours, theirs in zip(map(np.asarray, run(x, kernel)), map(np.asarray, exact), strict=True):
@@ -76,7 +73,7 @@ def test_float32_gradients_are_exact_to_rounding(size, stride, height, width):
 def test_mixed_products_round_where_there_are_units_for_it(monkeypatch, matrix_units):
     monkeypatch.setattr(convolution, "has_matrix_units", lambda: matrix_units)
     x, kernel = (np.float32(array) for array in operands(5, 40, 36, 3, 8))
-    mixed = jit(functools.partial(gradients, lambda x, kernel: convolve(x, kernel, 2, 2, "mixed")))(x, kernel)
+    mixed = jax.jit(functools.partial(gradients, lambda x, kernel: convolve(x, kernel, 2, 2, "mixed")))(x, kernel)
     exact = gradients(lambda x, kernel: reference(x, kernel, 2, 2), x, kernel)
     errors = [np.linalg.norm(ours - theirs) / np.linalg.norm(theirs) for ours, theirs in zip(mixed, exact, strict=True)]
     assert errors[0] < 1e-6, "forward, a processor computes in float32"

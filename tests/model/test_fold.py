@@ -15,8 +15,6 @@ from mdnvo_jax.model.conv import BATCH_NORM_EPSILON, LAYERS, ConvStack
 from mdnvo_jax.model.head import Labels, mixture_from_outputs
 from mdnvo_jax.model.network import build, template
 
-# Compiling takes most of the time of these tests.
-jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
 IMAGE = ImageConfig(height=33, width=65, channels=1, normalisation="local_contrast")
 MODEL = ModelConfig(width=1 / 64, lstm_hidden=8, lstm_layers=2, components=2)
 LABELS = Labels(np.arange(6.0), np.arange(1, 7) / 10)
@@ -42,12 +40,12 @@ def stack_variables(seed=0, height=33, width=65, multiplier=1 / 64):
 
 def unfolded(variables, pairs):
     stack = ConvStack(variables["params"]["conv6"]["bias"].size / 1024, 0.1)
-    maps = jit(functools.partial(stack.apply, train=False))(variables, pairs, jnp.ones(len(pairs), bool))
+    maps = jax.jit(functools.partial(stack.apply, train=False))(variables, pairs, jnp.ones(len(pairs), bool))
     return np.asarray(maps).reshape(len(pairs), -1)
 
 
 def folded(variables, pairs):
-    return np.asarray(jit(fold.folded_stack)(fold.fold_stack(variables["params"], variables["batch_stats"]), pairs))
+    return np.asarray(jax.jit(fold.folded_stack)(fold.fold_stack(variables["params"], variables["batch_stats"]), pairs))
 
 
 def test_a_layer_by_hand():
@@ -108,7 +106,7 @@ def test_the_parts_make_the_network(bidirectional, mirrored):
     mask = np.array([[True] * 4, [True, False, True, False]])
 
     def density(images):
-        return mixture_from_outputs(jit(network.apply)(variables, images, mask), LABELS, model_config)
+        return mixture_from_outputs(jax.jit(network.apply)(variables, images, mask), LABELS, model_config)
 
     expected = density(images)
     if mirrored:
@@ -122,11 +120,13 @@ def test_the_parts_make_the_network(bidirectional, mirrored):
     model = fold.Folded(
         fold.fold_stack(params["stack"], statistics["stack"]), params["lstm"], params["head"], LABELS, np.ones(6)
     )
-    features = [jit(fold.pair_features, static_argnums=(2, 3))(model, window, IMAGE, model_config) for window in images]
-    gates = jit(fold.pair_gates)(model, jnp.stack(features))
+    features = [
+        jax.jit(fold.pair_features, static_argnums=(2, 3))(model, window, IMAGE, model_config) for window in images
+    ]
+    gates = jax.jit(fold.pair_gates)(model, jnp.stack(features))
     size = 32 * (1 + bidirectional) * (1 + mirrored)
     assert gates.shape == (2, 4, fold.gates_size(model, model_config)) == (2, 4, size)
-    found = jit(fold.window_densities, static_argnums=3)(model, gates, mask, model_config, scale)
+    found = jax.jit(fold.window_densities, static_argnums=3)(model, gates, mask, model_config, scale)
     for part, whole in zip(found, expected, strict=True):
         np.testing.assert_allclose(part[mask], whole[mask], rtol=1e-4, atol=1e-4)
 

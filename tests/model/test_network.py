@@ -13,9 +13,6 @@ IMAGE = ImageConfig(height=33, width=65, channels=1, normalisation="local_contra
 MODEL = ModelConfig(width=1 / 64, lstm_hidden=8, lstm_layers=2, components=2, conv_dropout=0.1, lstm_dropout=0.2)
 BATCH, STEPS = 2, 4
 
-# Compiling takes most of the time of these tests.
-jit = functools.partial(jax.jit, compiler_options={"xla_backend_optimization_level": 0})
-
 
 @pytest.fixture(scope="module")
 def network():
@@ -29,7 +26,7 @@ def variables(network):
 
 @pytest.fixture(scope="module")
 def evaluate(network, variables):
-    return jit(functools.partial(network.apply, variables))
+    return jax.jit(functools.partial(network.apply, variables))
 
 
 @pytest.fixture(scope="module")
@@ -50,7 +47,7 @@ def train(network):
 
         return jax.grad(loss, has_aux=True)(variables["params"])
 
-    return jit(run)
+    return jax.jit(run)
 
 
 @pytest.fixture
@@ -140,7 +137,7 @@ def test_only_a_bidirectional_network_looks_ahead(network, variables, images, bi
         params = initialise(network, jax.random.key(0), IMAGE, STEPS)
     changed = images.copy()
     changed[:, 3:] = 255 - changed[:, 3:]
-    run = jit(functools.partial(network.apply, params))
+    run = jax.jit(functools.partial(network.apply, params))
     differs = (np.abs(run(images, ALL) - run(changed, ALL)) > 1e-6).any((0, 2))
     # Frame 3 is the second of step 2.
     assert differs.tolist() == ([True] * 4 if bidirectional else [False, False, True, True])
@@ -167,7 +164,7 @@ def test_both_parts_drop_units(variables, images, part):
         rngs = {"dropout": key}
         return network.apply(variables, images, ALL, train=True, rngs=rngs, mutable=["batch_stats"])[0]
 
-    run = jit(run)
+    run = jax.jit(run)
     assert (run(jax.random.key(0)) != run(jax.random.key(1))).any()
 
 
