@@ -16,8 +16,8 @@ config = dataclasses.replace(
     shipped,
     # The same view, at two thirds of its pixels in each direction.
     image=dataclasses.replace(shipped.image, height=32, width=128, camera=(74.133, 74.133, 63.5, 12.167)),
-    # As the table in BENCHMARKS.md was made: with the dropout of the first five sittings, a still camera, frames as they
-    # are, with a free view, forwards in time.
+    # As the table in BENCHMARKS.md was made: with the dropout of the first five sittings, a still camera, a free view,
+    # in the light that is there, forwards in time.
     model=dataclasses.replace(shipped.model, width=0.125, lstm_hidden=64, lstm_dropout=0.1),
     data=dataclasses.replace(
         shipped.data,
