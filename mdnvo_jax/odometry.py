@@ -183,9 +183,14 @@ def are_correlations(values: np.ndarray) -> bool:
     return values.shape == (6,) and bool(((values >= 0) & (values <= 1)).all())
 
 
+def is_scale_sigma(sigma: float) -> bool:
+    """Whether `sigma` can be the standard deviation of a scale's error: a number of 0 or more."""
+    return bool(np.isfinite(sigma) and sigma >= 0)
+
+
 def check_scale_sigma(sigma: float) -> None:
     """Raise an InputError where the standard deviation of a scale's error is no number of 0 or more."""
-    if not (np.isfinite(sigma) and sigma >= 0):
+    if not is_scale_sigma(sigma):
         raise InputError(f"the scale's sigma is {sigma}: expected a share such as 0.05, 0 or more")
 
 

@@ -13,7 +13,7 @@ import numpy as np
 
 from mdnvo_jax import files
 from mdnvo_jax.errors import InputError
-from mdnvo_jax.odometry import COMPONENTS, are_correlations
+from mdnvo_jax.odometry import COMPONENTS, are_correlations, is_scale_sigma
 
 # In the folder of a step, so that it is copied and deleted with the weights and never meets others.
 FILE = "sigma_scale.json"
@@ -85,7 +85,7 @@ def read(step_folder: str | Path) -> SigmaScale | None:
         raise InputError(f"{path} is damaged ({type(error).__name__}: {error}): {mend}") from error
     if scale.shape != (len(COMPONENTS),) or not (np.isfinite(scale) & (scale > 0)).all():
         raise InputError(f"{path}: scale {scale.tolist()}: expected six factors above 0: {mend}")
-    if not (np.isfinite(found.scale_sigma) and found.scale_sigma >= 0):
+    if not is_scale_sigma(found.scale_sigma):
         raise InputError(f"{path}: scale_sigma {found.scale_sigma}: expected 0 or more: {mend}")
     for name in ("correlation", "serial_correlation"):
         value = getattr(found, name)
