@@ -59,11 +59,10 @@ def done(tmp_path_factory):
     overrides = [str(part) for name, value in TINY.items() for part in (f"--{name}", value)]
     given = ["--workdir", str(model), "--data.root", str(root), "--data.version", VERSION, *overrides]
     # A process of its own, as for a user; it finds the package of this checkout.
-    own = {"PYTHONPATH": os.pathsep.join([str(REPOSITORY), *sys.path])}
     trained = subprocess.run(
         [sys.executable, "-m", "mdnvo_jax.train", "configs/mdn_vo_nuscenes.py", *given],
         cwd=REPOSITORY,
-        env={**os.environ, **own},
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([str(REPOSITORY), *sys.path])},
         capture_output=True,
         text=True,
     )

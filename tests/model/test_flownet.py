@@ -31,8 +31,7 @@ def zeros(image_config, width):
 def features(network, variables, first, second):
     frames = [normalise(frames, network.image_config.normalisation) for frames in (first, second)]
     stack = fold_stack(variables["params"]["stack"], variables["batch_stats"]["stack"])
-    run = jax.jit(folded_stack)
-    return run(stack, jnp.concatenate(frames, -1))
+    return jax.jit(folded_stack)(stack, jnp.concatenate(frames, -1))
 
 
 @pytest.mark.parametrize(

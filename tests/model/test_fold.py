@@ -120,9 +120,8 @@ def test_the_parts_make_the_network(bidirectional, mirrored):
     model = fold.Folded(
         fold.fold_stack(params["stack"], statistics["stack"]), params["lstm"], params["head"], LABELS, np.ones(6)
     )
-    features = [
-        jax.jit(fold.pair_features, static_argnums=(2, 3))(model, window, IMAGE, model_config) for window in images
-    ]
+    pair_features = jax.jit(fold.pair_features, static_argnums=(2, 3))
+    features = [pair_features(model, window, IMAGE, model_config) for window in images]
     gates = jax.jit(fold.pair_gates)(model, jnp.stack(features))
     size = 32 * (1 + bidirectional) * (1 + mirrored)
     assert gates.shape == (2, 4, fold.gates_size(model, model_config)) == (2, 4, size)
