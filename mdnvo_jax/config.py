@@ -188,7 +188,8 @@ class TrainingConfig:
     # Stack parameters made by bin/convert_flownet; empty: Xavier everywhere. Paper: FlowNet.
     initial_stack: str = ""
     # Start from the whole of another training: "shipped" for the weights of the package, or a checkpoint's folder. Its
-    # statistics of the labels, which are the units of the outputs, are taken over. Empty: from scratch.
+    # statistics of the labels, which are the units of the outputs, are taken over. model.width and model.lstm_hidden
+    # may be larger than there: the network then begins with the same outputs. Empty: from scratch.
     initial_weights: str = ""
     # Steps of an epoch that may be skipped because the loss, the gradient or another metric is not finite: they leave
     # the network as it is and are counted in metrics.csv. 0: the first such step ends the training.

@@ -20,7 +20,7 @@ from jax import Array
 
 from mdnvo_jax.model.dropout import drop
 
-_GATES = 4
+GATES = 4
 
 LstmParams = dict[str, dict[str, dict[str, Any]]]
 
@@ -55,12 +55,12 @@ def _init_direction(rng: Array, inputs: int, hidden: int) -> dict[str, Array]:
 
     def xavier(rng: Array, fan_in: int) -> Array:
         limit = (6 / (fan_in + hidden)) ** 0.5
-        return jax.random.uniform(rng, (fan_in, _GATES * hidden), minval=-limit, maxval=limit)
+        return jax.random.uniform(rng, (fan_in, GATES * hidden), minval=-limit, maxval=limit)
 
     return {
         "input_kernel": xavier(input_rng, inputs),
         "recurrent_kernel": xavier(recurrent_rng, hidden),
-        "bias": jnp.zeros(_GATES * hidden),
+        "bias": jnp.zeros(GATES * hidden),
     }
 
 
@@ -159,7 +159,7 @@ def _recurrence_forward(
     def step(state: tuple[Array, Array], inputs: tuple[Array, Array]) -> tuple[tuple[Array, Array], Any]:
         cell, output = state
         gates, valid = inputs
-        i, f, g, o = jnp.split(gates + output @ recurrent_kernel, _GATES, axis=-1)
+        i, f, g, o = jnp.split(gates + output @ recurrent_kernel, GATES, axis=-1)
         i, f, g, o = jax.nn.sigmoid(i), jax.nn.sigmoid(f), jnp.tanh(g), jax.nn.sigmoid(o)
         new_cell = f * cell + i * g
         tanh = jnp.tanh(new_cell)

@@ -14,6 +14,7 @@ from mdnvo_jax.data.sequence import Sequence
 from mdnvo_jax.data.windows import label_statistics
 from mdnvo_jax.errors import InputError
 from mdnvo_jax.model.flownet import load_stack
+from mdnvo_jax.model.grow import grow
 from mdnvo_jax.model.head import Labels
 from mdnvo_jax.model.network import Network
 from mdnvo_jax.training import checkpoint
@@ -30,6 +31,8 @@ _FREE = (
     "activations",
     "rematerialise",
 )
+# What may be larger than it was.
+_GROWING = ("width", "lstm_hidden")
 
 
 def check(config: Config) -> None:
@@ -52,21 +55,21 @@ def check(config: Config) -> None:
         for section in ("image", "model")
         for field in dataclasses.fields(getattr(config, section))
         for mine, their in [(getattr(getattr(whole, section), field.name) for whole in (config, theirs))]
-        if mine != their and field.name not in _FREE
+        if mine != their and field.name not in _FREE and not (field.name in _GROWING and mine > their)
     ]
     if differing:
         raise InputError(
             f"training.initial_weights {config.training.initial_weights} does not fit: {'; '.join(differing)}: "
-            "set these fields as they were"
+            "set these fields as they were (model.width and model.lstm_hidden may be larger)"
         )
 
 
 def start(network: Network, config: Config, sequences: Many[Sequence]) -> tuple[dict[str, Any], Labels]:
     """Return the variables to start from, and the statistics that labels are standardised with.
 
-    Initial weights bring the statistics of their own labels, since they are the units of their outputs. Of layers that
-    serve training alone (the one for optical flow), those they lack are drawn and those that are not wanted left
-    out.
+    Initial weights bring the statistics of their own labels, since they are the units of their outputs. Where the
+    network is wider than theirs they are grown into it, and its outputs are theirs. Of layers that serve training alone
+    (the one for optical flow), those they lack are drawn and those that are not wanted left out.
 
     Args:
       network: of the configuration.
@@ -79,8 +82,7 @@ def start(network: Network, config: Config, sequences: Many[Sequence]) -> tuple[
     variables = initial_variables(network, config)
     if config.training.initial_weights:
         model, _, _ = checkpoint.trained(_folder(config))
-        params = {name: model.params.get(name, drawn) for name, drawn in variables["params"].items()}
-        return {"params": params, "batch_stats": model.batch_stats}, model.labels
+        return grow({"params": model.params, "batch_stats": model.batch_stats}, variables), model.labels
     if config.training.initial_stack:
         if config.image.normalisation != "flownet":
             print(

@@ -93,10 +93,24 @@ def test_the_layer_for_flow_is_left_out_where_it_is_not_wanted(tmp_path: Path, m
     assert sorted(variables["params"]) == ["head", "lstm", "stack"]
 
 
+def test_a_wider_network_starts_with_the_outputs_of_the_one_before(saved: Path) -> None:
+    wider = starting_from(saved, model__width=3 / 32, model__lstm_hidden=12, model__flow_weight=0.5)
+    initial.check(wider)
+    variables, labels = start(wider)
+    np.testing.assert_array_equal(labels.std, np.float32(LABELS.std))
+    mask = np.ones((1, 4), bool)
+    before = build(CONFIG.image, CONFIG.model).apply(
+        {"params": trained().params, "batch_stats": trained().batch_stats}, FRAMES[None, :5], mask
+    )
+    after = build(wider.image, wider.model).apply(variables, FRAMES[None, :5], mask)
+    np.testing.assert_allclose(after, before, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"model__components": 3}, r"does not fit: model\.components is 3, trained with 2: set"),
+        ({"model__width": 1 / 32}, r"model\.width is 0\.03125, trained with 0\.0625: set .* may be larger\)"),
         ({"model__coupling": "joint"}, r"model\.coupling is 'joint', trained with 'independent'"),
         ({"model__translation_floor_m": 0.01}, r"model\.translation_floor_m is 0\.01, trained with 0\.001"),
         ({"image__camera": ()}, r"image\.camera is \(\), trained with \(40\.0, 40\.0, 31\.5, 15\.5\)"),
@@ -155,9 +169,9 @@ def test_a_training_goes_on_from_there(
 def test_a_training_that_cannot_start_from_there_reads_no_data(
     config_file: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    given = [str(config_file), "--workdir", str(tmp_path / "run"), "--data.root", "gone", "--model.lstm_hidden", "9"]
+    given = [str(config_file), "--workdir", str(tmp_path / "run"), "--data.root", "gone", "--model.lstm_hidden", "7"]
     assert exit_code(train.main, given) == 2
-    assert "model.lstm_hidden is 9, trained with 8" in capsys.readouterr().err
+    assert "model.lstm_hidden is 7, trained with 8" in capsys.readouterr().err
     assert not (tmp_path / "run").exists()
 
 
