@@ -9,11 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 import mdnvo_jax
-from mdnvo_jax import backend, files
+from mdnvo_jax import backend, files, leaves
 from mdnvo_jax.errors import InputError
 from mdnvo_jax.export_example import EXAMPLE
 from mdnvo_jax.mixture import Mixture
-from mdnvo_jax.model.fold import Folded
 from mdnvo_jax.odometry import COMPONENTS
 from mdnvo_jax.predictor import Predictor
 from mdnvo_jax.streaming import StreamState, stream
@@ -47,7 +46,7 @@ def write(predictor: Predictor, directory: Path, *, openvino: bool = False) -> l
         raise InputError("flatbuffers is not installed: pip install 'mdnvo_jax[export]'") from error
 
     network = backend.openvino_stack(predictor.model.stack, predictor.config.image) if openvino else None
-    weights, start = _named(predictor.model), predictor.stream_start(predictor.model)._asdict()
+    weights, start = leaves.by_name(predictor.model), predictor.stream_start(predictor.model)._asdict()
     exported = _exported(predictor, weights, start)
     results = jax.tree.unflatten(exported.out_tree, exported.out_avals)[1]
     with files.whole_file(directory / STEP) as temporary:
@@ -90,12 +89,6 @@ def _exported(predictor: Predictor, weights: dict[str, jax.Array], start: dict[s
     return export.export(over_cameras, platforms=PLATFORMS)(
         shapes, jax.tree.map(batched, start), batched(image), batched(start["usable"])
     )
-
-
-def _named(model: Folded) -> dict[str, jax.Array]:
-    """Return the leaves of a model by a name, in their order."""
-    leaves = jax.tree.leaves_with_path(model)
-    return {jax.tree_util.keystr(path, simple=True, separator="."): leaf for path, leaf in leaves}
 
 
 def _about(predictor: Predictor, start: dict[str, jax.Array], results: dict[str, Any]) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """A small network whose outputs depend on what it sees, for tests of how prediction is run."""
 
 from pathlib import Path
+from typing import Any
 
 import cv2
 import jax
@@ -44,6 +45,12 @@ def trained() -> Model:
 
     variables = jax.tree.map_with_path(draw, variables)
     return initial_state(variables, CONFIG, LABELS).model
+
+
+def trained_variables() -> dict[str, Any]:
+    """Return the model's variables, as a network takes them."""
+    model = trained()
+    return {"params": model.params, "batch_stats": model.batch_stats}
 
 
 def save(folder: Path, config: Config = CONFIG) -> Path:

@@ -10,13 +10,10 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import Array
 
+from mdnvo_jax import leaves
 from mdnvo_jax.model.bilstm import GATES
 from mdnvo_jax.model.conv import LAYERS
-
-# A leaf of the variables, named from the root.
-_Path = tuple[str, ...]
 
 
 def grow(trained: dict[str, Any], drawn: dict[str, Any]) -> dict[str, Any]:
@@ -32,62 +29,50 @@ def grow(trained: dict[str, Any], drawn: dict[str, Any]) -> dict[str, Any]:
     Raises:
       ValueError: something of `trained` is larger than in `drawn`.
     """
-    there = {_names(path): np.asarray(leaf) for path, leaf in jax.tree.leaves_with_path(trained)}
     before, after = _sizes(trained), _sizes(drawn)
-
-    def grown(path: Any, leaf: Array) -> Array:
-        names = _names(path)
-        if names not in there:
-            return leaf
-        old, new = there[names], np.asarray(leaf)
-        result = _embedded(old.reshape(_runs(names, old.shape, *before)), new.reshape(_runs(names, new.shape, *after)))
-        if result is None:
-            raise ValueError(f"{'.'.join(names)} of shape {old.shape} does not fit into one of {new.shape}")
-        return jnp.asarray(result.reshape(new.shape))
-
-    return jax.tree.map_with_path(grown, drawn)
+    result = leaves.by_name(drawn)
+    for name, leaf in leaves.by_name(trained).items():
+        if name in result:
+            old, new = np.asarray(leaf), np.asarray(result[name])
+            parts, room = old.reshape(_runs(name, old.shape, *before)), new.reshape(_runs(name, new.shape, *after))
+            if (np.array(parts.shape) > room.shape).any():
+                raise ValueError(f"{name} of shape {old.shape} does not fit into one of {new.shape}")
+            result[name] = jnp.asarray(_embedded(parts, room).reshape(new.shape))
+    return jax.tree.unflatten(jax.tree.structure(drawn), result.values())
 
 
-def _embedded(old: np.ndarray, new: np.ndarray) -> np.ndarray | None:
-    """Return `new` with `old` in its first corner, and zero where units of `old`, on the last axis, read others'.
-
-    None where it does not fit.
-    """
-    if old.ndim != new.ndim or (np.array(old.shape) > new.shape).any():
-        return None
+def _embedded(old: np.ndarray, new: np.ndarray) -> np.ndarray:
+    """Return `new` with `old` in its first corner, and zero where units of `old`, on the last axis, read others'."""
     result = new.copy()
     result[..., : old.shape[-1]] = 0
     result[tuple(slice(length) for length in old.shape)] = old
     return result
 
 
-def _names(path: Any) -> _Path:
-    """Return the keys of a path through dictionaries."""
-    return tuple(entry.key for entry in path)
-
-
 def _sizes(variables: dict[str, Any]) -> tuple[int, int]:
     """Return the channels of the stack's last maps, and the hidden units of a direction of the LSTM."""
     params = variables["params"]
-    return params["stack"][LAYERS[-1].name]["bias"].size, params["lstm"]["layer0"]["forward"]["bias"].size // GATES
+    return params["stack"][LAYERS[-1].name]["bias"].size, params["lstm"]["layer0"]["forward"]["recurrent_kernel"].shape[
+        0
+    ]
 
 
-def _runs(names: _Path, shape: tuple[int, ...], channels: int, hidden: int) -> tuple[int, ...]:
+def _runs(name: str, shape: tuple[int, ...], channels: int, hidden: int) -> tuple[int, ...]:
     """Return the shape of a leaf whose axes hold one kind of unit each: those read before the last, of its own last.
 
     The LSTM reads the channels of one place of the maps after the other, later layers and the head the hidden units of
     one direction after the other; its own units stand gate by gate.
     """
-    match names[1:]:
-        case ("lstm", "layer0", _, "input_kernel"):
+    match name.split(".")[1:]:
+        case ["lstm", "layer0", _, "input_kernel"]:
             return -1, channels, GATES, hidden
-        case ("lstm", _, _, "input_kernel"):
+        case ["lstm", _, _, "input_kernel"]:
             return -1, hidden, GATES, hidden
-        case ("lstm", _, _, "recurrent_kernel"):
+        case ["lstm", _, _, "recurrent_kernel"]:
             return hidden, GATES, hidden
-        case ("lstm", _, _, "bias"):
+        case ["lstm", _, _, "bias"]:
             return GATES, hidden
-        case ("head", "kernel"):
+        case ["head", "kernel"]:
             return -1, hidden, shape[-1]
         case _:
             return shape

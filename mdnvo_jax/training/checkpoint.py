@@ -13,7 +13,7 @@ import jax
 import orbax.checkpoint as ocp
 
 from mdnvo_jax import config as configuration
-from mdnvo_jax import files
+from mdnvo_jax import files, leaves
 from mdnvo_jax.config import Config
 from mdnvo_jax.errors import InputError
 from mdnvo_jax.model.network import build
@@ -166,6 +166,5 @@ def read_model(step_folder: Path, template: Model) -> Model:
 
 
 def _shapes(tree: Any) -> dict[str, tuple[int, ...]]:
-    """Return the shape of every leaf by its path."""
-    leaves = jax.tree.leaves_with_path(tree)
-    return {jax.tree_util.keystr(path, simple=True, separator="."): tuple(leaf.shape) for path, leaf in leaves}
+    """Return the shape of every leaf by its name."""
+    return {name: tuple(leaf.shape) for name, leaf in leaves.by_name(tree).items()}

@@ -10,20 +10,21 @@ import jax
 import numpy as np
 import tensorstore as ts
 
+from mdnvo_jax import leaves
+
 
 class ChecksumError(ValueError):
     """Something read back is not what was saved."""
 
 
 def of_arrays(tree: Any) -> dict[str, str]:
-    """Return the SHA-256 of every array of a pytree, its type and shape included, by its path in the tree.
+    """Return the SHA-256 of every array of a pytree, its type and shape included, by its name (`leaves.by_name`).
 
     Args:
       tree: of arrays that this process holds wholly: on one device, or a copy on every device, as `parallel.replicated`
         has it. So every process of a training computes the same.
     """
-    leaves = jax.tree.leaves_with_path(tree)
-    return {jax.tree_util.keystr(path, simple=True, separator="."): _of_array(leaf) for path, leaf in leaves}
+    return {name: _of_array(leaf) for name, leaf in leaves.by_name(tree).items()}
 
 
 def of_json(value: Any) -> str:

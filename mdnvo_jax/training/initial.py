@@ -58,9 +58,10 @@ def check(config: Config) -> None:
         if mine != their and field.name not in _FREE and not (field.name in _GROWING and mine > their)
     ]
     if differing:
+        growing = " and ".join(f"model.{name}" for name in _GROWING)
         raise InputError(
             f"training.initial_weights {config.training.initial_weights} does not fit: {'; '.join(differing)}: "
-            "set these fields as they were (model.width and model.lstm_hidden may be larger)"
+            f"set these fields as they were ({growing} may be larger)"
         )
 
 

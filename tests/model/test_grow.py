@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from small_model import CONFIG, FRAMES, trained
+from small_model import CONFIG, FRAMES, trained_variables
 
 from mdnvo_jax.config import Config
 from mdnvo_jax.model.grow import grow
@@ -15,7 +15,11 @@ from mdnvo_jax.training.state import initial_variables
 
 WINDOWS = jnp.asarray(np.stack([FRAMES[:5], FRAMES[10:15], FRAMES[20:25]]))
 MASK = jnp.array([[True] * 4, [True] * 4, [True, True, False, False]])
-SMALL = {"params": trained().params, "batch_stats": trained().batch_stats}
+
+
+@pytest.fixture(scope="module")
+def small() -> dict:
+    return trained_variables()
 
 
 def like(**model: object) -> Config:
@@ -28,24 +32,24 @@ def drawn(config: Config) -> tuple[Network, dict]:
 
 
 @pytest.mark.parametrize("sizes", [{"width": 3 / 32}, {"lstm_hidden": 13}, {"width": 1 / 8, "lstm_hidden": 11}])
-def test_outputs_are_what_they_were(sizes: dict) -> None:
+def test_outputs_are_what_they_were(small: dict, sizes: dict) -> None:
     network, fresh = drawn(like(**sizes))
-    grown = grow(SMALL, fresh)
+    grown = grow(small, fresh)
     assert jax.tree.map(jnp.shape, grown) == jax.tree.map(jnp.shape, fresh)
-    before = build(CONFIG.image, like().model).apply(SMALL, WINDOWS, MASK)
+    before = build(CONFIG.image, like().model).apply(small, WINDOWS, MASK)
     # Far from what a network of that size gives without having learned anything.
     assert np.abs(network.apply(fresh, WINDOWS, MASK) - before).max() > 0.1
     np.testing.assert_allclose(network.apply(grown, WINDOWS, MASK), before, atol=1e-5)
 
 
-def test_outputs_in_training_are_what_they_were_as_well() -> None:
+def test_outputs_in_training_are_what_they_were_as_well(small: dict) -> None:
     network, fresh = drawn(like(width=1 / 8, lstm_hidden=11, lstm_dropout=0.0))
 
     def train(network: Network, variables: dict) -> tuple:
         return network.apply(variables, WINDOWS, MASK, train=True, mutable=["batch_stats"])
 
-    after, statistics = train(network, grow(SMALL, fresh))
-    before, known = train(build(CONFIG.image, like(lstm_dropout=0.0).model), SMALL)
+    after, statistics = train(network, grow(small, fresh))
+    before, known = train(build(CONFIG.image, like(lstm_dropout=0.0).model), small)
     np.testing.assert_allclose(after, before, atol=1e-4)
     layer = known["batch_stats"]["stack"]["conv6"]["mean"]
     np.testing.assert_allclose(
@@ -54,17 +58,16 @@ def test_outputs_in_training_are_what_they_were_as_well() -> None:
 
 
 def test_a_causal_lstm_grows_as_well() -> None:
-    small, wide = like(bidirectional=False), like(bidirectional=False, width=1 / 8, lstm_hidden=11)
-    network, variables = drawn(small)
-    wider, fresh = drawn(wide)
+    network, variables = drawn(like(bidirectional=False))
+    wider, fresh = drawn(like(bidirectional=False, width=1 / 8, lstm_hidden=11))
     before = network.apply(variables, WINDOWS, MASK)
     np.testing.assert_allclose(wider.apply(grow(variables, fresh), WINDOWS, MASK), before, atol=1e-5)
 
 
-def test_new_units_learn_from_the_first_step_on() -> None:
+def test_new_units_learn_from_the_first_step_on(small: dict) -> None:
     """Kernels of zero have gradients, and after one step along them, so have the kernels of new units."""
     network, fresh = drawn(like(width=1 / 8, lstm_hidden=11))
-    grown = grow(SMALL, fresh)
+    grown = grow(small, fresh)
 
     @jax.jit
     def gradient(params: dict) -> dict:
@@ -85,16 +88,16 @@ def test_new_units_learn_from_the_first_step_on() -> None:
         assert np.abs(second["stack"][name]["kernel"][..., size:]).max() > 0, name
 
 
-def test_as_wide_it_is_the_same_network_to_the_bit() -> None:
+def test_as_wide_it_is_the_same_network_to_the_bit(small: dict) -> None:
     _, fresh = drawn(CONFIG)
-    grown = grow(SMALL, fresh)
+    grown = grow(small, fresh)
     for (path, leaf), (_, other) in zip(
-        jax.tree.leaves_with_path(grown), jax.tree.leaves_with_path(SMALL), strict=True
+        jax.tree.leaves_with_path(grown), jax.tree.leaves_with_path(small), strict=True
     ):
         np.testing.assert_array_equal(leaf, other, err_msg=jax.tree_util.keystr(path))
 
 
-def test_no_network_shrinks() -> None:
+def test_no_network_shrinks(small: dict) -> None:
     for sizes in ({"width": 1 / 32}, {"lstm_hidden": 7}):
         with pytest.raises(ValueError, match="does not fit into one of"):
-            grow(SMALL, drawn(like(**sizes))[1])
+            grow(small, drawn(like(**sizes))[1])

@@ -9,7 +9,7 @@ import cv2
 import jax
 import numpy as np
 import pytest
-from small_model import CONFIG, FRAMES, LABELS, save, trained
+from small_model import CONFIG, FRAMES, LABELS, save, trained, trained_variables
 
 from mdnvo_jax import predictor, train, weights
 from mdnvo_jax.config import Config, load_config
@@ -62,7 +62,7 @@ def test_everything_that_predicts_comes_from_there(saved: Path) -> None:
         config = starting_from(path)
         initial.check(config)
         variables, labels = start(config)
-        assert_same(variables, {"params": trained().params, "batch_stats": trained().batch_stats})
+        assert_same(variables, trained_variables())
         # The outputs are in units of these, whatever the new data is like.
         np.testing.assert_array_equal(labels.mean, np.float32(LABELS.mean))
         np.testing.assert_array_equal(labels.std, np.float32(LABELS.std))
@@ -99,9 +99,7 @@ def test_a_wider_network_starts_with_the_outputs_of_the_one_before(saved: Path) 
     variables, labels = start(wider)
     np.testing.assert_array_equal(labels.std, np.float32(LABELS.std))
     mask = np.ones((1, 4), bool)
-    before = build(CONFIG.image, CONFIG.model).apply(
-        {"params": trained().params, "batch_stats": trained().batch_stats}, FRAMES[None, :5], mask
-    )
+    before = build(CONFIG.image, CONFIG.model).apply(trained_variables(), FRAMES[None, :5], mask)
     after = build(wider.image, wider.model).apply(variables, FRAMES[None, :5], mask)
     np.testing.assert_allclose(after, before, atol=1e-5)
 
