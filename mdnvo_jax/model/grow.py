@@ -52,9 +52,8 @@ def _embedded(old: np.ndarray, new: np.ndarray) -> np.ndarray:
 def _sizes(variables: dict[str, Any]) -> tuple[int, int]:
     """Return the channels of the stack's last maps, and the hidden units of a direction of the LSTM."""
     params = variables["params"]
-    return params["stack"][LAYERS[-1].name]["bias"].size, params["lstm"]["layer0"]["forward"]["recurrent_kernel"].shape[
-        0
-    ]
+    hidden = params["lstm"]["layer0"]["forward"]["recurrent_kernel"].shape[0]
+    return params["stack"][LAYERS[-1].name]["bias"].size, hidden
 
 
 def _runs(name: str, shape: tuple[int, ...], channels: int, hidden: int) -> tuple[int, ...]:
